@@ -33,10 +33,11 @@ map: $(MAP_INSTALLED)
 
 installed: $(DEV_INSTALLED)
 
-# The tests run side by side; more threads in each would only get in their way.
+# The tests run side by side; more threads in each would only get in their way. In the order of their folders
+# the last files are short: by their numbers of tests, the last ones would be long files of a test or two.
 test: export OMP_NUM_THREADS = 1
 test: $(DEV_INSTALLED)
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 check: $(DEV_INSTALLED)
 	$(BIN)/ruff format --check .
@@ -76,14 +77,20 @@ clean:
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
+	$(INSTALL) --upgrade pip
+
+# The kernels are compiled while what the package needs is chosen and unpacked.
+define INSTALL_WITH
+	@echo "installing into $(VENV): some minutes"
+	$(BIN)/python .ci/needed.py $(1) >$(VENV)/needed-$(1).txt
+	$(INSTALL) --no-deps -e . & $(INSTALL) -r $(VENV)/needed-$(1).txt && wait $$!
+endef
 
 $(MAP_INSTALLED): $(INSTALLED_FROM) | $(BIN)/python
-	@echo "installing into $(VENV): some minutes"
-	$(INSTALL) -e '.[map]'
+	$(call INSTALL_WITH,map)
 	@touch $@
 
 # The development packages include those for mapping.
 $(DEV_INSTALLED): $(INSTALLED_FROM) | $(BIN)/python
-	@echo "installing into $(VENV): some minutes"
-	$(INSTALL) -e '.[dev]'
+	$(call INSTALL_WITH,dev)
 	@touch $(MAP_INSTALLED) $@

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -107,12 +108,34 @@ def _made(sources: str, folder: str) -> Path:
         language="c++",
         py_limited_api=_IS_STABLE,
     )
-    command = Distribution({"name": "v2hdm", "ext_modules": [extension]}).get_command_obj("build_ext")
+    distribution = Distribution(
+        {"name": "v2hdm", "ext_modules": [extension], "cmdclass": {"build_ext": _build_ext()}}
+    )
+    command = distribution.get_command_obj("build_ext")
     command.build_lib = command.build_temp = folder
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
         command.ensure_finalized()
         command.run()
     return Path(command.get_ext_fullpath(_NAME))
+
+
+def _build_ext() -> type[Any]:
+    """A command of setuptools that compiles as many sources of an extension at once as there are cores."""
+    from setuptools.command.build_ext import build_ext
+
+    class BuildExt(build_ext):
+        def build_extensions(self) -> None:
+            compile_in_turn = self.compiler.compile
+
+            def compile_at_once(sources: list[str], **options: Any) -> list[str]:
+                with ThreadPoolExecutor(os.cpu_count()) as pool:
+                    compiled = pool.map(lambda source: compile_in_turn([source], **options), sources)
+                    return [path for paths in compiled for path in paths]
+
+            self.compiler.compile = compile_at_once
+            super().build_extensions()
+
+    return BuildExt
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """Each extra keeps what the documents promise: ``make installs`` installs the wheel and tries it.
 
 The wheel is built once. The base install and ``[map]`` have an environment each; ``[map,ros]``,
-``[map,video]`` and ``[map,text]`` stand on ``[map]``. A page, or a section, begins with what it needs; the
-first command there with each word of :data:`PROMISES` runs in the environment with just that, on the small
-drive of the documents' tests, which the first command of ``[map]`` renders and maps. The documents' tests run
-all commands.
+``[map,video]``, ``[map,text]`` and ``[map,pdf]`` stand on ``[map]``. A page, or a section, begins with what
+it needs; the first command there with each word of :data:`PROMISES` runs in the environment with just that,
+on the small drive of the documents' tests, which the first command of ``[map]`` renders and maps. The
+documents' tests run all commands.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ MORE = {
         "python -c 'from v2hdm.words.recogniser import load_recogniser; assert load_recogniser(1)'",
         MAP_PORT,
     ),
-    "map,pdf": (f"{MAP_PORT} report.pdf=true",),
+    "map,pdf": ("v2hdm report outputs/port2 --pdf",),
 }
 """Commands, by extras, for work that no page shows as a short command of its own."""
 
@@ -192,6 +192,8 @@ def main() -> int:
         failed += tried("map,video", video, lines_of("map,video"), here)
         text = mapping.beside(packages / "text", *EXTRAS["text"])
         failed += tried("map,text", text, lines_of("map,text"), here)
+        pdf = mapping.beside(packages / "pdf", *EXTRAS["pdf"])
+        failed += tried("map,pdf", pdf, lines_of("map,pdf"), here)
     print(f"{failed} failed" if failed else "every promise is kept")
     return failed
 

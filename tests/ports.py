@@ -39,8 +39,8 @@ def small_port(**changes: object) -> PortConfig:
 def run_config(drive: Path, output: Path, **changes: object) -> RunConfig:
     """A run over a drive in one process, with a cache of its own beside the output."""
     drive_config = DriveConfig(path=str(drive))
-    given = {"name": "short", "drive": drive_config, "output": str(output), "workers": 1}
-    return RunConfig(**{"mosaic": False, **given, "cache": f"{output}.cache", **changes})
+    settings = {"name": "short", "drive": drive_config, "output": str(output), "workers": 1}
+    return RunConfig(**{"mosaic": False, **settings, "cache": f"{output}.cache", **changes})
 
 
 def blind_copy(drive: Path, target: Path) -> Path:

@@ -30,12 +30,12 @@ def s3() -> Iterator[Any]:
     running = server.ThreadedMotoServer("127.0.0.1", port=0, verbose=False)
     running.start()
     url = f"http://127.0.0.1:{running.get_host_and_port()[1]}"
-    told = {
+    variables = {
         "AWS_ENDPOINT_URL": url, "AWS_ACCESS_KEY_ID": "us", "AWS_SECRET_ACCESS_KEY": "secret",
         "AWS_DEFAULT_REGION": "us-east-1",
     }  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in told.items():
+        for name, value in variables.items():
             patch.setenv(name, value)
         s3fs.S3FileSystem.clear_instance_cache()
         client = boto3.client("s3")

@@ -70,10 +70,10 @@ def test_an_interruption_while_libraries_are_loaded_is_one_line(number, tmp_path
     line, (_, slow, _) = list(NEEDED.items())[number]
     signal = "SIGINT" if number % 2 else "SIGTERM"
     (tmp_path / f"{slow}.py").write_text(PRESSED_TWICE.format(signal=signal))
-    done = run_command(tmp_path, *line.split())
-    assert done.returncode == 2, done.stderr
-    assert done.stderr.startswith("error: interrupted")
-    assert done.stderr.count("\n") == 1
+    process = run_command(tmp_path, *line.split())
+    assert process.returncode == 2, process.stderr
+    assert process.stderr.startswith("error: interrupted")
+    assert process.stderr.count("\n") == 1
 
 
 @pytest.fixture(scope="module")
@@ -102,12 +102,12 @@ def test_a_library_that_is_not_installed_is_one_line_that_names_the_extra(line, 
     text = f'raise ModuleNotFoundError("not installed", name="{missing}")'
     (tmp_path / f"{missing}.py").write_text(text)
     command = [quick_python, "-c", WITHOUT, missing, *line.split()]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 2, done.stderr
-    own = [f"v2hdm {name}" for name in COMMANDS if line.startswith(f"v2hdm {name}")]
-    (called,) = own or [f"python -m {line.split()[0]}"]
-    assert done.stderr.startswith(f"error: {called} needs {missing}: install the {extra} extra")
-    assert done.stderr.count("\n") == 1
+    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert process.returncode == 2, process.stderr
+    of_command = [f"v2hdm {name}" for name in COMMANDS if line.startswith(f"v2hdm {name}")]
+    (called,) = of_command or [f"python -m {line.split()[0]}"]
+    assert process.stderr.startswith(f"error: {called} needs {missing}: install the {extra} extra")
+    assert process.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -117,17 +117,17 @@ def test_help_that_nobody_reads_to_its_end_is_no_error(arguments):
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as closed:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-m", *arguments], cwd=ROOT, stdout=closed, stderr=subprocess.PIPE, timeout=60
         )
-    assert (done.returncode, done.stderr) == (0, b"")
+    assert (process.returncode, process.stderr) == (0, b"")
 
 
 def test_a_warning_is_one_line_whatever_name_of_a_file_is_in_it(tmp_path):
     program = "main(['--version']); logging.warning('%s: cut off', 'a\\x1b[2J\\nerror: b.avi')"
     command = [sys.executable, "-c", f"import logging; from v2hdm.cli.main import main; {program}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert done.stderr == "WARNING:root:a?[2J error: b.avi: cut off\n"
+    process = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert process.stderr == "WARNING:root:a?[2J error: b.avi: cut off\n"
 
 
 @pytest.mark.parametrize(
@@ -144,14 +144,14 @@ def test_a_warning_is_one_line_whatever_name_of_a_file_is_in_it(tmp_path):
 def test_libraries_that_die_for_want_of_memory_are_one_line_and_exit_code_2(dies, says, tmp_path):
     (tmp_path / "cv2.py").write_text(dies)
     _, most = resource.getrlimit(resource.RLIMIT_AS)
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "v2hdm", "detect", "a.jpg"],
         env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (2**40, most)),
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-    assert done.stderr.startswith(f"error: {says}")
+    assert (process.returncode, process.stderr.count("\n")) == (2, 1), process.stderr
+    assert process.stderr.startswith(f"error: {says}")
 
 
 WAITS = """
@@ -182,10 +182,10 @@ def test_a_command_under_a_limit_of_memory_ends_with_whoever_started_it(number, 
         preexec_fn=limit_and_listen,
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    told = tmp_path / "told"
-    wait_until(lambda: told.is_file() and told.read_text())
-    child = Path("/proc", told.read_text())
-    assert int(told.read_text()) != parent.pid
+    process_file = tmp_path / "told"
+    wait_until(lambda: process_file.is_file() and process_file.read_text())
+    child = Path("/proc", process_file.read_text())
+    assert int(process_file.read_text()) != parent.pid
     parent.send_signal(number)
     assert parent.wait(30) in (-number, 2)
     wait_until(lambda: not child.exists() or ") Z " in (child / "stat").read_text())
@@ -204,14 +204,14 @@ class FullDisk(io.StringIO):
 
 
 def test_a_terminal_that_fails_stops_no_work_and_is_reported_at_its_end(monkeypatch, capsys):
-    done = []
+    finished = []
 
     def work():
         out, error = patient(sys.stdout), patient(sys.stderr)
         for stream in (out, error):
             for _ in range(3):
                 print("progress", file=stream, flush=True)
-        done.append("all of it")
+        finished.append("all of it")
 
     command = replace(COMMANDS["map"], run=lambda _: work())
     with monkeypatch.context() as patch:
@@ -220,15 +220,23 @@ def test_a_terminal_that_fails_stops_no_work_and_is_reported_at_its_end(monkeypa
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", FullDisk())
         assert command(()) == 0
-    assert done == ["all of it"] * 2
+    assert finished == ["all of it"] * 2
     assert "error: standard output, when all files were written: No space left" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("given", "expected"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
-def test_openmp_waits_without_spinning_unless_the_user_says_so(given, expected, tmp_path, monkeypatch):
-    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    (tmp_path / "torch.py").write_text("import os; raise SystemExit(os.environ['OMP_WAIT_POLICY'])")
-    assert run_command(tmp_path, "v2hdm.map", "+run=port2", **given).stderr.strip() == expected
+@pytest.mark.parametrize(
+    ("variable", "default"), [("OMP_WAIT_POLICY", "passive"), ("OPENBLAS_NUM_THREADS", "1")]
+)
+@pytest.mark.parametrize("setting", [None, "3"])
+def test_waiting_threads_do_not_spin_unless_the_user_says_so(
+    variable, default, setting, tmp_path, monkeypatch
+):
+    monkeypatch.delenv(variable, raising=False)
+    for library in ("numpy", "torch"):  # whichever is loaded first, reads the variables
+        (tmp_path / f"{library}.py").write_text(f"import os; raise SystemExit(os.environ[{variable!r}])")
+    environment = {} if setting is None else {variable: setting}
+    line = run_command(tmp_path, "v2hdm.map", "+run=port2", **environment).stderr.strip()
+    assert line == (setting or default)
 
 
 @pytest.mark.parametrize("number", ["-1.3e-05", "-2E3", "-.5", "-7", "-4."])
@@ -264,10 +272,10 @@ def test_help_explains_each_command_and_names_it(name, capsys):
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("map", "experiment", "simulate")])
-@pytest.mark.parametrize("given", ["", "--no\x1b[2Jsuch"])
-def test_arguments_that_are_missing_or_unknown_are_one_line_that_names_the_help(name, given, capsys):
+@pytest.mark.parametrize("arguments", ["", "--no\x1b[2Jsuch"])
+def test_arguments_that_are_missing_or_unknown_are_one_line_that_names_the_help(name, arguments, capsys):
     with pytest.raises(SystemExit, match="2"):
-        run([*name.split(), *given.split()])
+        run([*name.split(), *arguments.split()])
     error = capsys.readouterr().err
     assert re.fullmatch(rf"error: [ -~]+; see v2hdm {name} --help\n", error)
 
@@ -306,8 +314,8 @@ import v2hdm.verdict.check
 def test_what_must_be_light_loads_nothing_heavy_and_the_base_install_is_enough_on_a_vehicle(tmp_path):
     """The library, help, the detector, the store and the checks, in one process from light to heavy."""
     (tmp_path / "probe.py").write_text(IMPORTS)
-    done = run_command(tmp_path, "probe")
-    assert done.returncode == 0, done.stderr
+    process = run_command(tmp_path, "probe")
+    assert process.returncode == 0, process.stderr
     assert (tmp_path / "drawn" / "a.jpg").is_file()
 
 
@@ -319,10 +327,10 @@ print(*(name for name in sys.modules if name.split(".")[0] == "v2hdm"))
 
 
 def test_mapping_loads_no_writer_no_page_no_mosaic_and_no_renderer():
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
     )
-    modules = done.stdout.split()
+    modules = process.stdout.split()
     unneeded = "io.maps.formats io.calibration.writing io.importers.bag report.page report.photos mosaic"
     for name in (*unneeded.split(), "simulate.render"):
         assert not [module for module in modules if f"{module}.".startswith(f"v2hdm.{name}.")], name
@@ -333,9 +341,9 @@ def test_mapping_loads_no_writer_no_page_no_mosaic_and_no_renderer():
 )
 def test_every_command_reports_the_version(how, tmp_path):
     line = f"v2hdm {re.escape(__version__)}, (torch|no torch).*, (onnxruntime|no onnx).*, (numba|no numba).*"
-    told = run_command(tmp_path, *how, "--version").stdout
+    version = run_command(tmp_path, *how, "--version").stdout
     assert re.fullmatch(
-        line + ", weights [0-9a-f]{8}, kernels (compiled|in numpy and numba \\(.+\\))\n", told
+        line + ", weights [0-9a-f]{8}, kernels (compiled|in numpy and numba \\(.+\\))\n", version
     )
 
 

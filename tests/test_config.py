@@ -76,9 +76,11 @@ def test_the_path_of_a_folder_that_exists_needs_no_quotes(name, tmp_path, monkey
 
 
 def test_a_users_own_runs_join_the_shipped_ones(tmp_path, monkeypatch, capsys):
-    own = tmp_path / "conf" / "run"
-    own.mkdir(parents=True)
-    (own / "mysite.yaml").write_text("# @package _global_\nname: mysite\ndrive:\n  path: nowhere_at_all\n")
+    run_folder = tmp_path / "conf" / "run"
+    run_folder.mkdir(parents=True)
+    (run_folder / "mysite.yaml").write_text(
+        "# @package _global_\nname: mysite\ndrive:\n  path: nowhere_at_all\n"
+    )
     monkeypatch.chdir(tmp_path)
     assert run(["map", "--config-dir", str(tmp_path / "conf"), "+run=mysite"]) == 2
     assert "nowhere_at_all" in capsys.readouterr().err

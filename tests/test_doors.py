@@ -253,9 +253,9 @@ def problem_of():
     from v2hdm.adjust.problem import Observations
 
     none = np.zeros(0, dtype=np.int64)
-    seen = Observations(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
+    observations = Observations(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
     poses = np.eye(4)[None]
-    return v2hdm.Problem(np.array([[500.0, 500, 320, 240]]), poses, poses, seen, 0)
+    return v2hdm.Problem(np.array([[500.0, 500, 320, 240]]), poses, poses, observations, 0)
 
 
 @pytest.mark.parametrize("device", ["x", "cuda:99", "tpu"])

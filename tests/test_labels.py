@@ -28,11 +28,11 @@ def labelled(small_mapped, small_drive, tmp_path_factory):
 
 
 def of_markings(content):
-    return [one for one in content["annotations"] if "marking" in one]
+    return [annotation for annotation in content["annotations"] if "marking" in annotation]
 
 
-def ring(one):
-    return np.array(one["segmentation"][0]).reshape(-1, 2) - 0.5
+def ring(annotation):
+    return np.array(annotation["segmentation"][0]).reshape(-1, 2) - 0.5
 
 
 def test_corners_lie_within_three_tenths_of_a_pixel_of_true_ones(labelled, small_mapped, small_drive):
@@ -42,15 +42,15 @@ def test_corners_lie_within_three_tenths_of_a_pixel_of_true_ones(labelled, small
     true_of = {mapped[a].id: b for a, b in zip(*match_markings(mapped, truth.map.markings), strict=True)}
     assert len(true_of) > 15
     number = {drive.name_of(image.path): i for i, image in enumerate(drive.images)}
-    image_of = {one["id"]: number[one["file_name"]] for one in content["images"]}
+    image_of = {image["id"]: number[image["file_name"]] for image in content["images"]}
     off_px = []
-    for one in of_markings(content):
-        if one["whole"] and not one["iscrowd"] and one["marking"] in true_of:
-            i, corners = image_of[one["image_id"]], ring(one)
+    for annotation in of_markings(content):
+        if annotation["whole"] and not annotation["iscrowd"] and annotation["marking"] in true_of:
+            i, corners = image_of[annotation["image_id"]], ring(annotation)
             camera = drive.images[i].camera
             cam_from_map = truth.cam_from_vehicle[camera] @ np.linalg.inv(truth.map_from_vehicle[i])
             info = drive.cameras[camera].info
-            true = truth.map.markings[true_of[one["marking"]]].corners_map
+            true = truth.map.markings[true_of[annotation["marking"]]].corners_map
             px = distort_points(info, project_ground(info.intrinsic, cam_from_map, true)[0])
             corners = corners[:: len(corners) // 4]
             turned = [np.linalg.norm(np.roll(corners, k, axis=0) - px, axis=1) for k in range(4)]
@@ -61,7 +61,7 @@ def test_corners_lie_within_three_tenths_of_a_pixel_of_true_ones(labelled, small
 
 def test_most_labels_are_of_images_that_detect_nothing_there_or_far_off(labelled):
     counted, content, _ = labelled
-    shown = [one for one in of_markings(content) if not one["iscrowd"]]
+    shown = [annotation for annotation in of_markings(content) if not annotation["iscrowd"]]
     assert counted == {"images": 22, "shown": len(shown), "hidden": counted["hidden"],
                        "unsure": len(of_markings(content)) - len(shown)}  # fmt: skip
     assert len(shown) > 5 * counted["unsure"]
@@ -71,24 +71,36 @@ def test_a_marking_that_something_hides_in_one_image_is_no_label_there(
     labelled, small_mapped, small_drive, tmp_path
 ):
     _, content, _ = labelled
-    one = max((one for one in of_markings(content) if not one["iscrowd"]), key=lambda one: one["area"])
+    annotation = max(
+        (annotation for annotation in of_markings(content) if not annotation["iscrowd"]),
+        key=lambda annotation: annotation["area"],
+    )
     drive = read_drive(shutil.copytree(small_drive, tmp_path / "drive"))
-    (name,) = [image["file_name"] for image in content["images"] if image["id"] == one["image_id"]]
+    (name,) = [image["file_name"] for image in content["images"] if image["id"] == annotation["image_id"]]
     path = drive.root / name
     pixels = cv2.imread(str(path))
     low, high = (
-        np.clip(edge, 0, None).astype(int) for edge in (ring(one).min(0) - 30, ring(one).max(0) + 30)
+        np.clip(edge, 0, None).astype(int)
+        for edge in (ring(annotation).min(0) - 30, ring(annotation).max(0) + 30)
     )
     pixels[low[1] : high[1], low[0] : high[0]] = (70, 80, 90)
     cv2.imwrite(str(path), pixels)
     write_labels(small_mapped[0], drive, tmp_path / "labels")
     again = json.loads((tmp_path / "labels" / FILE).read_text())
-    key = (one["image_id"], one["marking"])
-    there = {(each["image_id"], each["marking"]): each["iscrowd"] for each in of_markings(again)}
-    before = {(each["image_id"], each["marking"]): each["iscrowd"] for each in of_markings(content)}
-    assert there.get(key, 1) == 1
+    key = (annotation["image_id"], annotation["marking"])
+    crowd_of = {
+        (annotation["image_id"], annotation["marking"]): annotation["iscrowd"]
+        for annotation in of_markings(again)
+    }
+    before = {
+        (annotation["image_id"], annotation["marking"]): annotation["iscrowd"]
+        for annotation in of_markings(content)
+    }
+    assert crowd_of.get(key, 1) == 1
     others = [pair for pair in before if pair[0] != key[0]]
-    changed = {pair: (before[pair], there.get(pair)) for pair in others if there.get(pair) != before[pair]}
+    changed = {
+        pair: (before[pair], crowd_of.get(pair)) for pair in others if crowd_of.get(pair) != before[pair]
+    }
     # The usual contrast of the marking itself is another without that image.
     of_others = {states for (_, marking), states in changed.items() if marking != key[1]}
     assert of_others <= {(0, 1)}, "one that is hidden makes others less sure, and none surer"
@@ -101,7 +113,7 @@ def test_the_training_reads_them_and_takes_nothing_unsure_for_a_marking(labelled
     assert len(images) == 22
     assert all(image.path.is_file() for image in images)
     kinds = [shape.kinds for image in images for shape in image.shapes]
-    assert kinds.count((UNKNOWN,)) == sum(one["iscrowd"] for one in content["annotations"])
+    assert kinds.count((UNKNOWN,)) == sum(annotation["iscrowd"] for annotation in content["annotations"])
     assert ("diamond",) in kinds
 
 

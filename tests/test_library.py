@@ -30,19 +30,22 @@ def names(small_drive, coarse_mosaics, tmp_path_factory):
     result = v2hdm.map_drive(port, accuracy_goal_cm=10.0, workers=1, cache=folder / "cache")
     survey_camera(folder, port, read_truth(port))
     public = {name: getattr(v2hdm, name) for name in v2hdm.__all__}
-    own = {"folder": folder, "port": port, "result": result, "points": folder / "points.csv"}
-    return {**public, **own, "np": np, "cv2": cv2}
+    places = {"folder": folder, "port": port, "result": result, "points": folder / "points.csv"}
+    return {**public, **places, "np": np, "cv2": cv2}
 
 
 @pytest.mark.parametrize("name", sorted(set(v2hdm.__all__) - SETTINGS))
 def test_the_examples_of_each_public_name_run(name, names):
     documented = getattr(v2hdm, name)
-    own = documented.to_geodataframe if name == "HDMap" else None
-    if own is not None:
+    method = documented.to_geodataframe if name == "HDMap" else None
+    if method is not None:
         pytest.importorskip("geopandas", reason="no geopandas: pip install 'v2hdm[gis]'")
     finder, runner = doctest.DocTestFinder(recurse=False), doctest.DocTestRunner()
     examples = [
-        test for one in (documented, own) if one is not None for test in finder.find(one, name, globs=names)
+        test
+        for source in (documented, method)
+        if source is not None
+        for test in finder.find(source, name, globs=names)
     ]
     assert any(test.examples for test in examples)
     for test in examples:
@@ -69,8 +72,8 @@ def test_what_is_saved_is_what_the_command_writes(names, tmp_path):
     from v2hdm.cli.main import run
 
     saved = names["result"].save(tmp_path / "saved")
-    given = f"name=run output={tmp_path} cache={names['folder'] / 'cache'} workers=1 accuracy_goal_cm=10"
-    assert run(["map", f"drive.path={names['port'].root}", *given.split()]) == 0
+    settings = f"name=run output={tmp_path} cache={names['folder'] / 'cache'} workers=1 accuracy_goal_cm=10"
+    assert run(["map", f"drive.path={names['port'].root}", *settings.split()]) == 0
     written = {path.relative_to(tmp_path / "run") for path in (tmp_path / "run").rglob("*") if path.is_file()}
     of_runs = {Path("config.yaml"), Path("run.log")}
     assert {path.relative_to(saved) for path in saved.rglob("*") if path.is_file()} == written - of_runs

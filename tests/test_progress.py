@@ -11,8 +11,8 @@ from v2hdm.progress import progress_lines
 def test_a_log_has_a_line_when_a_task_begins_and_ends():
     lines: list[str] = []
     tell = progress_lines(lines.append)
-    for done in range(101):
-        tell("detect", done, 100)
+    for count in range(101):
+        tell("detect", count, 100)
     tell("map", 0, 3)
     assert lines == ["detect: 0 of 100", "detect: 100 of 100", "map: 0 of 3"]
 

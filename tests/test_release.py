@@ -39,7 +39,7 @@ def released(tmp_path_factory):
 
 
 def test_an_index_takes_both_archives(released, capfd):
-    assert not check([str(one) for one in released], strict=True), capfd.readouterr().out
+    assert not check([str(archive) for archive in released], strict=True), capfd.readouterr().out
 
 
 def test_the_wheel_holds_the_library_with_its_data_and_nothing_else(released):
@@ -89,19 +89,19 @@ def test_the_conda_recipe_asks_for_what_the_wheel_does():
     assert recipe["about"]["license"] == PROJECT["license"]
     assert recipe["about"]["license_file"] == PROJECT["license-files"]
     assert recipe["build"]["python"]["entry_points"] == [f"v2hdm = {PROJECT['scripts']['v2hdm']}"]
-    asked = {f"python {PROJECT['requires-python']}"}
-    for one in map(Requirement, [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["map"]]):
-        limits = ",".join(sorted(map(str, one.specifier), reverse=True))
-        asked.add(f"{CONDA.get(one.name, one.name.lower())} {limits}")
-    assert set(recipe["requirements"]["run"]) == asked
+    requirements = {f"python {PROJECT['requires-python']}"}
+    for requirement in map(Requirement, [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["map"]]):
+        limits = ",".join(sorted(map(str, requirement.specifier), reverse=True))
+        requirements.add(f"{CONDA.get(requirement.name, requirement.name.lower())} {limits}")
+    assert set(recipe["requirements"]["run"]) == requirements
 
 
 def test_the_image_is_of_the_pinned_versions_and_its_user_is_not_root():
     lines = (ROOT / "Dockerfile").read_text().splitlines()
-    told = [line.split()[0] for line in lines if re.match("[A-Z]+ ", line)]
+    instructions = [line.split()[0] for line in lines if re.match("[A-Z]+ ", line)]
     assert any("-c constraints.txt" in line for line in lines)
     assert "'.[map]'" in "".join(lines)
-    assert told.index("USER") < told.index("ENTRYPOINT")
+    assert instructions.index("USER") < instructions.index("ENTRYPOINT")
     assert next(line for line in lines if line.startswith("USER")) != "USER root"
     # Whatever the build copies is let through to it.
     let_through = re.findall(r"^!(.+)$", (ROOT / ".dockerignore").read_text(), re.MULTILINE)
@@ -121,8 +121,8 @@ def test_the_workflow_runs_what_a_change_must_pass():
 def test_an_audit_that_reaches_no_advisories_says_so():
     place = f"BIN={Path(sys.executable).parent}", "ADVISORIES=http://127.0.0.1:9/"
     command = ["make", "--no-print-directory", "--old-file", ".venv/.installed-dev", *place, "audit"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout == "audit skipped: no advisories at http://127.0.0.1:9/\n"
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    assert process.stdout == "audit skipped: no advisories at http://127.0.0.1:9/\n"
 
 
 def test_a_release_publishes_wheels_archive_site_and_image_without_a_key():
@@ -131,8 +131,10 @@ def test_a_release_publishes_wheels_archive_site_and_image_without_a_key():
     assert set(jobs) == {"wheels", "archive", "pypi", "docs", "container"}
     assert (ROOT / jobs["wheels"]["uses"]).is_file()
     assert jobs["pypi"]["permissions"] == {"id-token": "write"}
-    told = [step["run"].split() for job in jobs.values() for step in job.get("steps", ()) if "run" in step]
-    targets = {words[1] for words in told if words[0] == "make"}
+    commands = [
+        step["run"].split() for job in jobs.values() for step in job.get("steps", ()) if "run" in step
+    ]
+    targets = {words[1] for words in commands if words[0] == "make"}
     assert targets == {"sbom", "docs"}
     rules = (ROOT / "Makefile").read_text()
     assert all(re.search(f"^{target}:", rules, re.MULTILINE) for target in targets)

@@ -68,9 +68,9 @@ def test_no_command_repeats_a_secret_and_no_file_or_folder_has_it(name, tmp_path
             code = ended.code
         printed = capsys.readouterr()
         assert code == 2, url
-        told = printed.out + printed.err
-        assert SECRET not in told.replace("\n", "")
-        assert SECRET.split("/")[1] not in told.replace("\n", ""), told
+        output = printed.out + printed.err
+        assert SECRET not in output.replace("\n", "")
+        assert SECRET.split("/")[1] not in output.replace("\n", ""), output
     for path in tmp_path.rglob("*"):
         assert SECRET.split("/")[1] not in str(path)
         if path.is_file():

@@ -22,9 +22,7 @@ _OF_PIECES = np.array([1 / 5, 1 / 5])
 
 _LEAST_PX = np.array([15, 7])  # least sides of what is taken away there, px: width and height
 _DARKNESS = 12.0  # grey levels that noise makes of black, added so that it is not taken for paint at night
-_LEAST_CONTRAST = (
-    0.1  # least logarithm of how much brighter paint is than its ground: that of very worn paint
-)
+_LEAST_CONTRAST = 0.1  # least log ratio of paint's brightness to its ground's: that of very worn paint
 _PAINT_FROM = 0.55  # share of the contrast near by from which a pixel is paint
 _GROUND_TO = 0.3  # share of the contrast near by to which a pixel is ground
 _FAINT = 0.35  # paint in one place has at least this share of the contrast of all of the outline's

@@ -1,4 +1,4 @@
-"""The doors of the library: arguments are of the types that signatures state, or one line says which is not.
+"""The doors of the library: arguments have the types of their signatures, or one line names the wrong one.
 
 Types that a module names for type checkers alone are known by their names: of a class that is not loaded
 there is no instance.
@@ -87,7 +87,7 @@ def _check(value: object, hint: Any, where: str) -> None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether ``value`` is of the type ``hint``; what can be looked at only once is not looked into."""
+    """Whether ``value`` has the type ``hint``; iterators are not consumed to find out."""
     return _test_of(hint)(value)
 
 

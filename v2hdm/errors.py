@@ -17,13 +17,11 @@ _QUERY = re.compile(
 )
 _AZURE = ("abfs", "abfss")  # whose URLs name a container where others have a login
 _MASK = "***"
-_MOST_MASKED = (
-    10_000  # letters of a message that are looked at for secrets; the middle of longer ones is cut out
-)
+_MOST_MASKED = 10_000  # characters of a message that are searched for secrets; its middle is cut beyond
 
 
 def masked(text: str) -> str:
-    """A text without what URLs in it, also those taken for paths, hold of logins, passwords and tokens."""
+    """A text without the logins, passwords and tokens of its URLs, including URLs taken for paths."""
 
     def without_login(url: re.Match[str]) -> str:
         if url["scheme"].lower() in _AZURE and ":" not in url["login"]:
@@ -81,7 +79,7 @@ _NO_MEMORY = ("bad_alloc", "llocate memory", "ailed to allocate", "map segment",
 
 
 def describe(error: BaseException) -> str | None:
-    """An error in one line, as a user reads it; None for what is a bug of ours."""
+    """An error as one line for the user; None for a bug."""
     if isinstance(error, V2hdmError):
         return str(error)
     if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
@@ -98,7 +96,7 @@ def describe(error: BaseException) -> str | None:
 
 
 def shown(content: object) -> str:
-    """``content`` as a short piece of one line: what a user wrote, quoted where it is a text."""
+    """User input as a short piece of one line; texts are quoted."""
     if content is None:
         return "nothing"
     if isinstance(content, bool):
@@ -124,7 +122,7 @@ def bounded(message: str, most: int = _MOST_LETTERS) -> str:
 
 
 def one_line(message: str) -> str:
-    """A message whose words come from files of strangers: none ends the line or moves the cursor.
+    """A message with text from untrusted files: nothing in it ends the line or moves the cursor.
 
     What its URLs hold of passwords is :func:`masked`.
     """
@@ -133,7 +131,7 @@ def one_line(message: str) -> str:
 
 
 def need(module: str, extra: str, purpose: str, error: type[V2hdmError]) -> ModuleType:
-    """The optional ``module``, imported; where it is absent, ``error`` names the ``extra`` that brings it."""
+    """Import the optional ``module``; if it is missing, raise ``error``, which names its ``extra``."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as missing:

@@ -38,7 +38,7 @@ from v2hdm.store.files import csv_text
 from v2hdm.store.remote import is_url, place_of
 from v2hdm.store.results import WriteFile, growing_folder
 
-ERROR = "ERROR"  # status of a drive of which there is no result
+ERROR = "ERROR"  # status of a drive without a result
 STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red", ERROR: "bold red"}
 
 

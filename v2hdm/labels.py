@@ -65,8 +65,8 @@ _DETECTED = np.array([0.98, 0.005, 0.015])
 
 _FAINT_SHARE = 0.1  # share of the sides that are faint where shown
 _ALIKE = 0.5  # power of the likelihood of one side: the four of one image err alike
-_PAIRS_OF_BIN = 100  # detected sides by which contrasts of one size in the image are learned
-_MOST_BINS = 8  # sizes in the image, at most, of which contrasts are learned
+_PAIRS_OF_BIN = 100  # least detected sides to learn the contrasts of one size in the image
+_MOST_BINS = 8  # most sizes in the image with contrasts of their own
 _LEAST_PAIRS = 8  # detected sides below which nothing is said of images without a detection
 _LEAST_SIGMA = 0.03  # least standard deviation of a side's contrast about the expected one
 _LEAST_IMAGES = 3  # images with a detection from which a side's contrast is taken from these alone
@@ -77,7 +77,7 @@ _LEAST_PX2 = 2.0  # area of the smallest piece that is labelled, px^2
 _INSIDE_M = 0.06  # distance inside an edge, m, at most at which paint is sampled
 _BESIDE_M = (0.1, 0.18)  # distances outside an edge, m, at which ground is sampled
 _SAMPLES = 7  # samples along the middle part of an edge
-_CLEAR_M = 1.0  # radius about a candidate that was left out, m, of which nothing is said
+_CLEAR_M = 1.0  # radius about a rejected candidate, m, that is labelled as unknown
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Eye:
-    """One image as a camera of the run: where it was, while each of its rows was read."""
+    """An image's camera and its poses while the rows were read."""
 
     info: CameraInfo
     cam_from_map: FloatArray  # (2, 4, 4), when the first and the last row was read
@@ -160,7 +160,7 @@ class _Eye:
         return distort_points(self.info, (1 - share) * first_px + share * last_px), depth_m
 
     def polygon(self, outline_map: FloatArray) -> tuple[FloatArray, bool]:
-        """The part (N, 2), recorded px, of an outline that lies in the image, and whether that is all."""
+        """The part (N, 2), recorded px, of an outline inside the image, and whether it is all of it."""
         depth_m = self.project(outline_map)[1]
         part = outline_map
         if (depth_m < _NEAREST_M).any():
@@ -243,7 +243,7 @@ def write_labels(
 
 
 def _detected(facts: Facts) -> Mapping[str, set[int]]:
-    """By image the markings of which the mapping accepted three corners or more as points."""
+    """For each image, the markings with three or more corners that the mapping accepted as points."""
     residuals = facts.residuals
     detected = dict[str, set[int]]()
     if residuals is not None:
@@ -279,7 +279,7 @@ def _views(
 
 
 def _silent(eye: _Eye, facts: Facts, range_m: float) -> list[FloatArray]:
-    """Polygons of an image of which the map says nothing: ground beyond the range, candidates left out.
+    """Polygons of an image where the map is silent: ground beyond the range, rejected candidates.
 
     Markings and symbols of accuracy C are candidates here: labels have to be right to some pixels.
     """
@@ -393,10 +393,10 @@ def _coco(
     states: IntArray,
     silent: Sequence[tuple[int, FloatArray]],
 ) -> dict[str, Any]:
-    """COCO instances; what is unsure, and ground of which nothing is known, is ``iscrowd``."""
+    """COCO instances; unsure shapes and unknown ground are ``iscrowd``."""
     kinds = sorted({outline.kind for outline in outlines})
     number_of = {kind: n for n, kind in enumerate([*kinds, UNKNOWN], start=1)}
-    # A marking that reaches beyond the range comes after the ground there, of which it is no part.
+    # A marking that reaches beyond the range comes after the ground there, which does not contain it.
     annotations = [_instance(number_of[UNKNOWN], image, polygon, True) for image, polygon in silent]
     annotations += [
         # COCO has its origin at the corner of the first pixel, this project at its centre.

@@ -48,7 +48,7 @@ def compare_maps(
     tolerance_m: Tolerance = 0.05,
     results: str | Path | None = None,
 ) -> Comparison:
-    """Compare the paint of a map with its design: each shape right, off, missing or not inspected.
+    """Compare the paint of a map with its design: each shape is right, off, missing or not inspected.
 
     Args:
         built: the map.
@@ -72,7 +72,7 @@ def compare_maps(
     from v2hdm.asbuilt.reading import read_design
 
     if results is not None and not Path(results).is_dir():
-        raise MapFileError(f"{results}: is no folder of results; give one, or leave results out")
+        raise MapFileError(f"{results}: is not a result folder; give one, or leave results out")
     if isinstance(design, HDMap):
         meant = design_of_map(design, built.origin, "the design")
     else:
@@ -85,7 +85,7 @@ def compare_maps(
 def build_problem(
     drive: Drive, detections: Sequence[ImageDetections], options: MappingOptions | None = None
 ) -> Problem:
-    """State the bundle adjustment of a drive: its sightings associated, with all that is known beforehand.
+    """Set up the bundle adjustment of a drive: associated sightings, initial values and priors.
 
     Args:
         drive: the drive.
@@ -96,7 +96,7 @@ def build_problem(
         Cameras, frames and corners with their observations (recorded pixels, the lens undone) and priors.
 
     Raises:
-        MappingError: there is nothing to map, or the detections are of another drive.
+        MappingError: there is nothing to map, or the detections belong to another drive.
         ConfigError: an option is wrong.
 
     >>> problem = build_problem(port, result.detections)
@@ -124,20 +124,20 @@ def simulate_port(
     workers: Processes = 1,
     progress: Steps | None = None,
 ) -> Drive:
-    """Render a drive through a port, with ground truth, into a folder of its own below ``folder``, once.
+    """Render a drive through a port, with ground truth, into a subfolder of ``folder``, unless it is there.
 
     Args:
-        folder: of all rendered drives, such as ``cache``.
-        config: the port; None takes 46 m of one, with one camera of half the usual pixels.
+        folder: parent of all rendered drives, such as ``cache``.
+        config: the port; None takes a short one: 46 m, one camera with half the usual pixels.
         workers: processes to render in.
         progress: called as ``progress(done, total)`` images.
 
     Returns:
-        The drive, read from there; those of a survey as one. Its truth is for evaluation only; mapping never
+        The drive; a survey's drives are joined to one. Its truth is for evaluation only: mapping never
         looks at it.
 
     Raises:
-        ConfigError: the settings make no port.
+        ConfigError: the settings do not describe a port.
         DriveError: the folder cannot be written.
 
     >>> drive = simulate_port(folder)

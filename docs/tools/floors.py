@@ -8,7 +8,11 @@ from xml.sax.saxutils import escape
 
 ROOT = Path(__file__).parents[2]
 PICTURE = ROOT / "docs" / "floors.svg"
-_WIDTH, _MARGIN, _FLOOR, _GAP, _LETTER = 800, 10, 26, 6, 7.3
+_WIDTH = 800  # width of the picture, px
+_MARGIN = 10  # margin of the picture, px
+_FLOOR = 26  # height of a floor, px
+_GAP = 6  # gap between parts and between floors, px
+_LETTER = 7.3  # width of a letter of the font below, px
 _STYLE = (
     "rect{fill:#e8eef4;stroke:#5b6b7b}rect.light{fill:#fff3d6}text{font:12px monospace;fill:#1b2733;"
     "text-anchor:middle}"

@@ -13,7 +13,7 @@ def reference_residuals(problem: Problem, x: FloatArray) -> dict[str, FloatArray
     cameras, frames, count = len(problem.intrinsic), len(problem.map_from_vehicle), problem.corner_count
     extrinsic, state, corners = np.split(x, [6 * cameras, len(x) - 2 * count])
     extrinsic, state, corners = extrinsic.reshape(-1, 6), state.reshape(frames, 6), corners.reshape(-1, 2)
-    seen = problem.observations
+    observations = problem.observations
     rotation = Rotation.from_rotvec(extrinsic[:, 3:]).as_matrix() @ problem.cam_from_vehicle[:, :3, :3]
     centre = extrinsic[:, :3]
     # exp(s) of a pose: a rotation, and the translation V s_t with V by the textbook's closed form.
@@ -25,17 +25,21 @@ def reference_residuals(problem: Problem, x: FloatArray) -> dict[str, FloatArray
     turned = problem.map_from_vehicle[:, :3, :3] @ Rotation.from_rotvec(state[:, 3:]).as_matrix()
     shift = np.einsum("jab,jbc,jc->ja", problem.map_from_vehicle[:, :3, :3], v, state[:, :3])
     position = problem.map_from_vehicle[:, :3, 3] + shift
-    point_map = np.column_stack([corners, np.zeros(count)])[seen.corner] - position[seen.frame]
-    point_vehicle = np.einsum("kba,kb->ka", turned[seen.frame], point_map)
-    point = np.einsum("kab,kb->ka", rotation[seen.camera], point_vehicle - centre[seen.camera])
-    focal, principal = problem.intrinsic[seen.camera, :2], problem.intrinsic[seen.camera, 2:]
-    off = focal * point[:, :2] / point[:, 2:] + principal - seen.pinhole_px
-    whitened = np.einsum("kab,kb->ka", np.linalg.inv(np.linalg.cholesky(seen.covariance_px)), off)
+    point_map = (
+        np.column_stack([corners, np.zeros(count)])[observations.corner] - position[observations.frame]
+    )
+    point_vehicle = np.einsum("kba,kb->ka", turned[observations.frame], point_map)
+    point = np.einsum(
+        "kab,kb->ka", rotation[observations.camera], point_vehicle - centre[observations.camera]
+    )
+    focal, principal = problem.intrinsic[observations.camera, :2], problem.intrinsic[observations.camera, 2:]
+    off = focal * point[:, :2] / point[:, 2:] + principal - observations.pinhole_px
+    whitened = np.einsum("kab,kb->ka", np.linalg.inv(np.linalg.cholesky(observations.covariance_px)), off)
     prior = (centre - problem.centre_vehicle) / problem.centre_sigma_m
     parts = {"observations": whitened, "centres": prior, "states": state / problem.pose_sigma.by_state()}
     if problem.lengths is not None:
-        apart = np.linalg.norm(corners[problem.lengths.first] - corners[problem.lengths.second], axis=1)
-        parts["lengths"] = (apart - problem.lengths.length_m) / problem.lengths.sigma_m
+        distances_m = np.linalg.norm(corners[problem.lengths.first] - corners[problem.lengths.second], axis=1)
+        parts["lengths"] = (distances_m - problem.lengths.length_m) / problem.lengths.sigma_m
     if problem.control is not None:
         off_m = corners[problem.control.corner] - problem.control.points_map
         parts["control"] = off_m / problem.control.sigma_m

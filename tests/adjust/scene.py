@@ -82,7 +82,7 @@ def pose_errors(
     memory = np.exp([-step_m / drift.over_m for drift in sigma.drift_by_state()])
     out = rng.standard_normal((count, 6)) * np.sqrt(sigma.by_state() ** 2 - drift_sigma**2)
     if drift_sigma.any():
-        drift = np.column_stack([correlated(rng, count, 1, one) for one in memory])
+        drift = np.column_stack([correlated(rng, count, 1, share) for share in memory])
         out += drift * drift_sigma
     # The receiver's error keeps its direction in the map while the vehicle turns.
     out[:, :2] = (map_from_vehicle[:, :2, :2].transpose(0, 2, 1) @ out[:, :2, None])[..., 0]
@@ -210,9 +210,15 @@ def with_ground(scene: Scene, sigma_deg: float, sigma_m: float, seed: int = 0) -
     return replace(scene, problem=replace(scene.problem, ground=ground))
 
 
-def rows_of(seen: Observations, rows: np.ndarray | slice) -> Observations:
+def rows_of(observations: Observations, rows: np.ndarray | slice) -> Observations:
     """Some of the observations."""
-    parts = (seen.camera, seen.frame, seen.corner, seen.pinhole_px, seen.covariance_px)
+    parts = (
+        observations.camera,
+        observations.frame,
+        observations.corner,
+        observations.pinhole_px,
+        observations.covariance_px,
+    )
     return Observations(*(part[rows] for part in parts))
 
 
@@ -221,19 +227,22 @@ def with_late_clocks(scene: Scene, offset_s: np.ndarray) -> Scene:
 
     The speed swings by half, so that an offset in time is no offset in place.
     """
-    poses, seen = scene.problem.map_from_vehicle, scene.problem.observations
+    poses, observations = scene.problem.map_from_vehicle, scene.problem.observations
     step = np.linalg.inv(poses[:-1]) @ poses[1:]
     step = np.concatenate([step, step[-1:]])
     speed = 6.0 * (1 + 0.5 * np.sin(np.arange(len(poses)) / 7))
     length = np.linalg.norm(step[:, :2, 3], axis=1)
     twist = np.zeros((len(poses), 6))
     twist[:, 0], twist[:, 5] = speed, np.arctan2(step[:, 1, 0], step[:, 0, 0]) / length * speed
-    then = poses[seen.frame] @ exp(twist[seen.frame] * offset_s[seen.camera, None])
-    cam_from_map = scene.cam_from_vehicle[seen.camera] @ np.linalg.inv(then)
-    pixel = project(cam_from_map, scene.corners_map[seen.corner])
+    then = poses[observations.frame] @ exp(twist[observations.frame] * offset_s[observations.camera, None])
+    cam_from_map = scene.cam_from_vehicle[observations.camera] @ np.linalg.inv(then)
+    pixel = project(cam_from_map, scene.corners_map[observations.corner])
     pixel += np.random.default_rng(0).normal(0, PIXEL_SIGMA, pixel.shape)
     problem = replace(
-        scene.problem, twist_vehicle=twist, clock_sigma_s=0.05, observations=replace(seen, pinhole_px=pixel)
+        scene.problem,
+        twist_vehicle=twist,
+        clock_sigma_s=0.05,
+        observations=replace(observations, pinhole_px=pixel),
     )
     return replace(scene, problem=problem, map_from_vehicle=poses)
 

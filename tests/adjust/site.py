@@ -20,28 +20,32 @@ def site(drives: int, frames: int, overlap: int, *, every_m: float = 2.0, seed: 
     street = make_scene(
         seed, frames=drives * stride + overlap, every_m=every_m, start_error_deg=0.3, max_range_m=12.0
     )
-    seen, poses = street.problem.observations, street.problem.map_from_vehicle
+    observations, poses = street.problem.observations, street.problem.map_from_vehicle
     sigmas = [(DRIFTING, SCATTERING)[number % 2] for number in range(drives)]
     parts = []
     for number, sigma in enumerate(sigmas):
         rng = np.random.default_rng(seed + 100 * number)
-        own = slice(number * stride, number * stride + frames)
-        true = poses[own] @ exp(pose_errors(poses[own], sigma, 0.5, rng))
-        mine = np.flatnonzero((seen.frame >= own.start) & (seen.frame < own.stop))
-        frame = seen.frame[mine] - own.start
-        cam_from_map = street.cam_from_vehicle[seen.camera[mine]] @ np.linalg.inv(true)[frame]
-        pixel = project(cam_from_map, street.corners_map[seen.corner[mine]])
+        frames_of_drive = slice(number * stride, number * stride + frames)
+        true = poses[frames_of_drive] @ exp(pose_errors(poses[frames_of_drive], sigma, 0.5, rng))
+        mine = np.flatnonzero(
+            (observations.frame >= frames_of_drive.start) & (observations.frame < frames_of_drive.stop)
+        )
+        frame = observations.frame[mine] - frames_of_drive.start
+        cam_from_map = street.cam_from_vehicle[observations.camera[mine]] @ np.linalg.inv(true)[frame]
+        pixel = project(cam_from_map, street.corners_map[observations.corner[mine]])
         pixel = pixel + 0.7 * rng.standard_normal(pixel.shape)
         parts.append((mine, frame + number * frames, pixel))
     rows, frame, pixel = (np.concatenate(part) for part in zip(*parts, strict=True))
-    often = np.bincount(seen.corner[rows], minlength=street.problem.corner_count) >= 2
-    kept = often[seen.corner[rows]]
-    rows, frame, pixel = rows[kept], frame[kept], pixel[kept]
-    corner = (np.cumsum(often) - 1)[seen.corner[rows]]
+    often = np.bincount(observations.corner[rows], minlength=street.problem.corner_count) >= 2
+    is_often = often[observations.corner[rows]]
+    rows, frame, pixel = rows[is_often], frame[is_often], pixel[is_often]
+    corner = (np.cumsum(often) - 1)[observations.corner[rows]]
     return replace(
         street.problem,
         map_from_vehicle=np.concatenate([poses[n * stride : n * stride + frames] for n in range(drives)]),
-        observations=Observations(seen.camera[rows], frame, corner, pixel, seen.covariance_px[rows]),
+        observations=Observations(
+            observations.camera[rows], frame, corner, pixel, observations.covariance_px[rows]
+        ),
         corner_count=int(often.sum()),
         pose_sigma=tuple(sigmas),
         session=np.repeat(np.arange(drives), frames),

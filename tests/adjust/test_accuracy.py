@@ -60,7 +60,7 @@ def dense_bound_m2(scene):
 
     def residuals(x):
         parts = reference_residuals(scene.problem, x)
-        return np.concatenate([one.ravel() for name, one in parts.items() if name != "states"])
+        return np.concatenate([part.ravel() for name, part in parts.items() if name != "states"])
 
     steps = STEP * np.eye(len(truth))
     columns = [(residuals(truth + step) - residuals(truth - step)) / (2 * STEP) for step in steps]

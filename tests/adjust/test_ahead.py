@@ -12,15 +12,17 @@ from v2hdm.adjust import ahead, kernels
 
 def test_the_small_problem_calls_every_kernel_of_the_engine(monkeypatch):
     called, every = set(), set()
-    for found in pkgutil.iter_modules(kernels.__path__):
-        module = importlib.import_module(f"{kernels.__name__}.{found.name}")
-        for name, one in vars(module).copy().items():
-            if getattr(one, "__module__", "") == module.__name__ and getattr(one, "is_kernel", False):
-                every.add(f"{found.name}.{name}")
+    for listed in pkgutil.iter_modules(kernels.__path__):
+        module = importlib.import_module(f"{kernels.__name__}.{listed.name}")
+        for name, function in vars(module).copy().items():
+            if getattr(function, "__module__", "") == module.__name__ and getattr(
+                function, "is_kernel", False
+            ):
+                every.add(f"{listed.name}.{name}")
 
-                def watched(*arguments, one=one, key=f"{found.name}.{name}"):
+                def watched(*arguments, function=function, key=f"{listed.name}.{name}"):
                     called.add(key)
-                    return one(*arguments)
+                    return function(*arguments)
 
                 monkeypatch.setattr(module, name, watched)
     ahead.use_kernels()

@@ -45,8 +45,8 @@ def calls(monkeypatch):
 
 @pytest.mark.parametrize("pose_states", [(), POSE_STATES])
 def test_a_default_solve_starts_from_kornias_homographies_and_ends_with_its_projection(calls, pose_states):
-    found = solve(make_scene(0, frames=30).problem, SolveOptions(pose_states=pose_states))
-    assert found.status is Status.CONVERGED
+    solution = solve(make_scene(0, frames=30).problem, SolveOptions(pose_states=pose_states))
+    assert solution.status is Status.CONVERGED
     begin = len(calls) - 1 - calls[::-1].index("descend")
     assert "inverse_transformation" in calls[:begin]
     assert calls[begin + 1 :] == ["transform_points", "project_points"]
@@ -123,8 +123,8 @@ from v2hdm.adjust import SolveOptions, solve
 found = solve(make_scene(0, frames=30).problem, SolveOptions(pose_states=()))
 print(type(found.covariance.descent.engine).__name__, repr(found.cost), len(found.corner_covariance([0, 1])))
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    name, cost, size = done.stdout.split()
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    name, cost, size = process.stdout.split()
     expected = solve(make_scene(0, frames=30).problem, PAPER)
     assert (name, size) == (TorchEngine.__name__, "4")
     assert float(cost) == pytest.approx(expected.cost, rel=1e-9)

@@ -66,18 +66,18 @@ def seen_in(problem, keep):
 
 def bad_problems():
     problem = street()
-    seen = problem.observations
+    observations = problem.observations
 
     def off(name, index, value):
         """With a wrong entry in an array of the problem or of its observations."""
-        if name in vars(seen):
-            return with_observations(problem, **{name: changed(getattr(seen, name), index, value)})
+        if name in vars(observations):
+            return with_observations(problem, **{name: changed(getattr(observations, name), index, value)})
         return replace(problem, **{name: changed(getattr(problem, name), index, value)})
 
     def surveyed(corners, sigma_m):
         return replace(problem, control=ControlPoints(np.array(corners), np.zeros((2, 2)), np.array(sigma_m)))
 
-    twice = rows_of(seen, np.append(np.arange(len(seen.corner)), 5))
+    twice = rows_of(observations, np.append(np.arange(len(observations.corner)), 5))
     drifting = PoseSigma(position_drift=Drift(0.03, 10.0))
     one_more = replace(problem, corner_count=problem.corner_count + 1)
     skew = np.array([[1.0, 0.5], [-0.5, 1.0]])
@@ -89,14 +89,18 @@ def bad_problems():
         "covariance_px of observation 2 is not positive": off("covariance_px", 2, -np.eye(2)),
         "observation 4 names frame 999": off("frame", 4, 999),
         "observation 4 names camera -1": off("camera", 4, -1),
-        "camera 1 has no observation": seen_in(problem, seen.camera == 0),
+        "camera 1 has no observation": seen_in(problem, observations.camera == 0),
         f"corner {problem.corner_count} has no observation": one_more,
         "cam_from_vehicle 1 is not a rigid transform": off("cam_from_vehicle", (1, 0), mirrored),
         "map_from_vehicle 2 is not a rigid transform: its last row": off("map_from_vehicle", (2, 3, 0), 1.0),
         "covariance_px of observation 6 is not symmetric": off("covariance_px", 6, skew),
         "pinhole_px of observation 3 lies 1.11e.06 focal lengths": off("pinhole_px", (3, 0), 1e9),
-        "observations.corner holds float64": with_observations(problem, corner=seen.corner.astype(float)),
-        "observations.pinhole_px is a list": with_observations(problem, pinhole_px=seen.pinhole_px.tolist()),
+        "observations.corner holds float64": with_observations(
+            problem, corner=observations.corner.astype(float)
+        ),
+        "observations.pinhole_px is a list": with_observations(
+            problem, pinhole_px=observations.pinhole_px.tolist()
+        ),
         "intrinsic of camera 0 has a focal length": off("intrinsic", (0, 1), 0.0),
         "centre_sigma_m of camera 1 must be above 0": off("centre_sigma_m", (1, 2), 0.0),
         "belong together": replace(problem, centre_sigma_m=None),
@@ -106,7 +110,7 @@ def bad_problems():
         "twist_vehicle has shape": replace(problem, twist_vehicle=np.zeros((3, 6))),
         "control point 1 names corner -1": surveyed([0, -1], np.ones((2, 2))),
         "control point 0 is not finite": surveyed([0, 1], [[1.0, 0.0], [1.0, 1.0]]),
-        "there are no observations": replace(problem, observations=rows_of(seen, slice(0))),
+        "there are no observations": replace(problem, observations=rows_of(observations, slice(0))),
     }
 
 
@@ -165,9 +169,11 @@ def test_without_a_prior_on_a_straight_road_the_solution_is_called_undetermined(
 
 def test_a_corner_seen_once_is_mapped_and_says_so_by_its_covariance():
     scene = make_scene(4, frames=40)
-    seen = scene.problem.observations
-    keep = (seen.corner != 10) | (np.arange(len(seen.corner)) == np.flatnonzero(seen.corner == 10)[-1])
-    solution = solve(replace(scene.problem, observations=rows_of(seen, keep)), PAPER)
+    observations = scene.problem.observations
+    keep = (observations.corner != 10) | (
+        np.arange(len(observations.corner)) == np.flatnonzero(observations.corner == 10)[-1]
+    )
+    solution = solve(replace(scene.problem, observations=rows_of(observations, keep)), PAPER)
     assert solution.status is Status.CONVERGED
     assert finite(solution)
     once, often = solution.corner_covariance(np.array([[10], [11]]))
@@ -178,11 +184,11 @@ def test_a_corner_seen_once_is_mapped_and_says_so_by_its_covariance():
 @pytest.mark.parametrize("which", ["one observation", "one frame", "every corner once"])
 def test_too_few_observations_leave_the_solution_undetermined(which, options):
     problem = street(cameras=1)
-    seen = problem.observations
+    observations = problem.observations
     rows = {
         "one observation": np.arange(1),
-        "one frame": np.flatnonzero(seen.frame == 10),
-        "every corner once": np.unique(seen.corner, return_index=True)[1],
+        "one frame": np.flatnonzero(observations.frame == 10),
+        "every corner once": np.unique(observations.corner, return_index=True)[1],
     }
     solution = solve(seen_in(problem, rows[which]), options)
     assert solution.status is Status.UNDETERMINED
@@ -191,18 +197,18 @@ def test_too_few_observations_leave_the_solution_undetermined(which, options):
 
 def test_a_vehicle_that_never_moves_is_no_error():
     problem = street(cameras=1)
-    one = seen_in(problem, problem.observations.frame == 10)
-    seen, frames = one.observations, len(problem.map_from_vehicle)
-    pixel = np.tile(seen.pinhole_px, (frames, 1))
+    of_frame = seen_in(problem, problem.observations.frame == 10)
+    observations, frames = of_frame.observations, len(problem.map_from_vehicle)
+    pixel = np.tile(observations.pinhole_px, (frames, 1))
     again = Observations(
-        np.tile(seen.camera, frames),
-        np.repeat(np.arange(frames), len(seen.corner)),
-        np.tile(seen.corner, frames),
+        np.tile(observations.camera, frames),
+        np.repeat(np.arange(frames), len(observations.corner)),
+        np.tile(observations.corner, frames),
         pixel + np.random.default_rng(0).normal(0, 0.7, pixel.shape),
-        np.tile(seen.covariance_px, (frames, 1, 1)),
+        np.tile(observations.covariance_px, (frames, 1, 1)),
     )
     still = np.tile(problem.map_from_vehicle[10], (frames, 1, 1))
-    solution = solve(replace(one, map_from_vehicle=still, observations=again), PAPER)
+    solution = solve(replace(of_frame, map_from_vehicle=still, observations=again), PAPER)
     assert solution.status is Status.UNDETERMINED
     assert finite(solution)
 
@@ -216,34 +222,36 @@ def test_in_utm_coordinates_the_solution_is_the_same(options):
     here = replace(scene.problem, control=control)
     poses = here.map_from_vehicle.copy()
     poses[:, :2, 3] += utm
-    there = replace(
+    far_away = replace(
         here, map_from_vehicle=poses, control=replace(control, points_map=control.points_map + utm)
     )
-    near, far = solve(here, options), solve(there, options)
-    assert far.status is near.status is Status.CONVERGED
-    assert far.evaluations == near.evaluations
-    np.testing.assert_allclose(far.corners_map - utm, near.corners_map, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(far.cam_from_vehicle, near.cam_from_vehicle, rtol=0, atol=1e-8)
+    solved_here, far = solve(here, options), solve(far_away, options)
+    assert far.status is solved_here.status is Status.CONVERGED
+    assert far.evaluations == solved_here.evaluations
+    np.testing.assert_allclose(far.corners_map - utm, solved_here.corners_map, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(far.cam_from_vehicle, solved_here.cam_from_vehicle, rtol=0, atol=1e-8)
     np.testing.assert_allclose(
-        far.map_from_vehicle[:, :2, 3] - utm, near.map_from_vehicle[:, :2, 3], rtol=0, atol=1e-7
+        far.map_from_vehicle[:, :2, 3] - utm, solved_here.map_from_vehicle[:, :2, 3], rtol=0, atol=1e-7
     )
     groups = np.arange(here.corner_count)[:, None]
-    np.testing.assert_allclose(far.corner_covariance(groups), near.corner_covariance(groups), rtol=1e-4)
+    np.testing.assert_allclose(
+        far.corner_covariance(groups), solved_here.corner_covariance(groups), rtol=1e-4
+    )
 
 
 def test_an_observation_behind_the_camera_is_reported():
     scene = make_scene(5, frames=40, cameras=1, start_error_deg=0.5)
-    seen = scene.problem.observations
+    observations = scene.problem.observations
     # The corner of the last observation is claimed to be in view of a frame far beyond it.
     last = len(scene.problem.map_from_vehicle) - 1
-    first_corner = int(seen.corner[np.argmin(seen.frame)])
+    first_corner = int(observations.corner[np.argmin(observations.frame)])
     problem = with_observations(
         scene.problem,
-        camera=np.append(seen.camera, 0),
-        frame=np.append(seen.frame, last),
-        corner=np.append(seen.corner, first_corner),
-        pinhole_px=np.vstack([seen.pinhole_px, [640, 500]]),
-        covariance_px=np.concatenate([seen.covariance_px, seen.covariance_px[:1]]),
+        camera=np.append(observations.camera, 0),
+        frame=np.append(observations.frame, last),
+        corner=np.append(observations.corner, first_corner),
+        pinhole_px=np.vstack([observations.pinhole_px, [640, 500]]),
+        covariance_px=np.concatenate([observations.covariance_px, observations.covariance_px[:1]]),
     )
     solution = solve(problem, SolveOptions(pose_states=(), loss="geman_mcclure"))
     assert solution.status is Status.BEHIND_CAMERA

@@ -60,19 +60,21 @@ def example(*, lengths=True, rolling=False, frames=40, seed=3):
     diamonds = 4 * np.arange(count // 8)
     first = np.concatenate([diamonds, diamonds + 1, diamonds[:3] + 2])
     second = np.concatenate([diamonds + 1, diamonds + 2, diamonds[:3] + 3])
-    known = KnownLengths(first, second, np.full(len(first), 0.5), np.full(len(first), 0.004))
+    known_lengths = KnownLengths(first, second, np.full(len(first), 0.5), np.full(len(first), 0.004))
     control = ControlPoints(
         np.array([3, 17, 9]),
         scene.corners_map[[3, 17, 9]] + 0.01,
         np.array([[0.02, 0.03], [0.05, 0.01], [0.01, np.inf]]),
         np.array([[1.0, 0.0], [0.6, 0.8], [-0.8, 0.6]]),
     )
-    seen = replace(problem.observations, covariance_px=root @ root.transpose(0, 2, 1))
+    observations = replace(problem.observations, covariance_px=root @ root.transpose(0, 2, 1))
     if rolling:
-        seen = replace(seen, row_share=seen.pinhole_px[:, 1] / (HEIGHT - 1) - 0.5)
+        observations = replace(observations, row_share=observations.pinhole_px[:, 1] / (HEIGHT - 1) - 0.5)
         problem = replace(problem, read_out_s=np.array([0.03, 0.02]))
-    known = known if lengths else None
-    return replace(problem, observations=seen, pose_sigma=POSES, control=control, lengths=known)
+    known_lengths = known_lengths if lengths else None
+    return replace(
+        problem, observations=observations, pose_sigma=POSES, control=control, lengths=known_lengths
+    )
 
 
 def engines(problem, pose_states, clock=False, read_out=False):
@@ -97,18 +99,18 @@ def estimate_of(engine, problem, generator, size=0.01, behind=True):
     return Estimate(cameras, state, corners, clock)
 
 
-def assert_same(one, other, share=1e-12):
+def assert_same(values, other, share=1e-12):
     """Equal to a share of the largest of all, in tensors and in records of them."""
-    if isinstance(one, dict):
-        assert list(one) == list(other)
-        for name in one:
-            assert_same(one[name], other[name], share)
-    elif is_dataclass(one):
-        assert_same(vars(one), vars(other), share)
-    elif isinstance(one, float):
-        assert one == pytest.approx(other, rel=share, abs=0)
+    if isinstance(values, dict):
+        assert list(values) == list(other)
+        for name in values:
+            assert_same(values[name], other[name], share)
+    elif is_dataclass(values):
+        assert_same(vars(values), vars(other), share)
+    elif isinstance(values, float):
+        assert values == pytest.approx(other, rel=share, abs=0)
     elif other.numel():
-        assert float((one - other).abs().max()) <= share * float(other.abs().max())
+        assert float((values - other).abs().max()) <= share * float(other.abs().max())
 
 
 def rounding_of(factor):
@@ -141,26 +143,26 @@ def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, length
     poses = numba.poses(estimate)
     assert_same(numba.residuals(poses, estimate.corners_map), by_torch.residuals(poses, estimate.corners_map))
     plan = replace(by_torch.plan(), most_tiles=numba.plan().most_tiles)
-    found, systems = [], []
+    results, systems = [], []
     for engine in (numba, by_torch):
         system = ReducedSystem(engine.arrays, plan, engine.spread(estimate))
-        found.append(engine.eliminate(system, estimate, robust))
+        results.append(engine.eliminate(system, estimate, robust))
         systems.append(system)
-    one, other = found
+    by_numba, other = results
     for name in ("state", "clock"):
         assert_same(getattr(systems[0].spread, name), getattr(systems[1].spread, name))
     assert_same(numba.prior_blocks(estimate), by_torch.prior_blocks(estimate), 5e-12)
-    assert_same(one.terms, other.terms)
+    assert_same(by_numba.terms, other.terms)
     assert_same(by_torch.terms(estimate, robust), other.terms)
     for name in ("extrinsic", "frame_state", "clock_s"):
-        assert_same(getattr(one.gradient, name), getattr(other.gradient, name))
+        assert_same(getattr(by_numba.gradient, name), getattr(other.gradient, name))
     # A robust loss may leave a corner next to no information: rounding grows with its factor's condition.
     share = rounding_of(other.corner_factor)
-    assert_same(one.whitened, other.whitened, share)
-    assert_same(one.coupled, other.coupled, share)
+    assert_same(by_numba.whitened, other.whitened, share)
+    assert_same(by_numba.coupled, other.coupled, share)
     lone = ~numba.arrays.joined & ~numba.arrays.joined.roll(-1)
-    assert_same(one.corner_factor.lower[:, lone], other.corner_factor.lower[:, lone])
-    for group, joint in zip(one.corner_factor.joint, other.corner_factor.joint, strict=True):
+    assert_same(by_numba.corner_factor.lower[:, lone], other.corner_factor.lower[:, lone])
+    for group, joint in zip(by_numba.corner_factor.joint, other.corner_factor.joint, strict=True):
         assert torch.equal(group.begin, joint.begin)
         assert_same(group.factor, joint.factor, share)
     assert_same(systems[0]._of_pairs, systems[1]._of_pairs)
@@ -169,12 +171,12 @@ def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, length
         assert_same(tile * lower, systems[1].matrix.tiles[place] * lower, share)
     run = numba.arrays.gather(torch.arange(3, 12))
     corners = estimate.corners_map[3:12]
-    assert_same(one.coupling(run, corners), other.coupling(run, corners))
+    assert_same(by_numba.coupling(run, corners), other.coupling(run, corners))
     by_residual = torch.as_tensor(rng.normal(0, 1, numba.arrays.measured.shape))
-    pulled = [each.pull(estimate, each.spread(estimate), by_residual) for each in (numba, by_torch)]
+    pulled = [engine.pull(estimate, engine.spread(estimate), by_residual) for engine in (numba, by_torch)]
     assert_same(*pulled)
     by_corner = torch.as_tensor(rng.normal(0, 1, estimate.corners_map.shape))
-    for mine, theirs in zip(one.carry(by_corner), other.carry(by_corner), strict=True):
+    for mine, theirs in zip(by_numba.carry(by_corner), other.carry(by_corner), strict=True):
         assert_same(mine, theirs, share)
 
 
@@ -189,14 +191,14 @@ def test_engines_agree_on_a_step(pose_states, clock, loss):
     whitening = factorise(numba, plan, estimate, Loss(loss, 3.0))
     expected = factorise(by_torch, plan, estimate, Loss(loss, 3.0))
     step = whitening.step(0.001 * torch.randn(whitening.size, generator=generator, dtype=torch.float64))
-    one, other = (made.linearised.evaluate(*step) for made in (whitening, expected))
-    assert_same(one.estimate, other.estimate)
-    assert_same(one.terms, other.terms)
+    by_numba, other = (engine_state.linearised.evaluate(*step) for engine_state in (whitening, expected))
+    assert_same(by_numba.estimate, other.estimate)
+    assert_same(by_numba.terms, other.terms)
     # Differences of large sums; and where a corner is hardly known, last digits count a thousand times.
     for name in ("extrinsic", "frame_state", "clock_s"):
-        assert_same(getattr(one.gradient, name), getattr(other.gradient, name), 1e-9)
-    assert_same(one.whitened, other.whitened, 1e-9)
-    assert_same(one.coupled, other.coupled, 1e-9)
+        assert_same(getattr(by_numba.gradient, name), getattr(other.gradient, name), 1e-9)
+    assert_same(by_numba.whitened, other.whitened, 1e-9)
+    assert_same(by_numba.coupled, other.coupled, 1e-9)
 
 
 @pytest.mark.parametrize("behind", [False, True])
@@ -229,27 +231,27 @@ def test_engines_agree_on_the_start_and_on_the_report(pose_states, clock):
     assert bool((fixed == expected_fixed).all())
     estimate = estimate_of(numba, problem, torch.Generator().manual_seed(2))
     focal = problem.intrinsic[:, :2]
-    for one, other in zip(numba.report(estimate, focal), by_torch.report(estimate, focal), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-9)
+    for value, other in zip(numba.report(estimate, focal), by_torch.report(estimate, focal), strict=True):
+        np.testing.assert_allclose(value, other, rtol=1e-11, atol=1e-9)
 
 
 @pytest.mark.parametrize(("pose_states", "clock"), MODELS)
 def test_a_solve_ends_where_that_of_torch_ends(pose_states, clock):
     problem = example()
     options = SolveOptions(pose_states=pose_states, clock_offset=clock, gap_tolerance=1e-13)
-    found = solve(problem, options)
+    solution = solve(problem, options)
     expected = solve(problem, replace(options, engine="torch"))
-    assert found.cost == pytest.approx(expected.cost, rel=1e-10)
-    assert found.status is expected.status
-    np.testing.assert_allclose(found.corners_map, expected.corners_map, atol=1e-5)
+    assert solution.cost == pytest.approx(expected.cost, rel=1e-10)
+    assert solution.status is expected.status
+    np.testing.assert_allclose(solution.corners_map, expected.corners_map, atol=1e-5)
     np.testing.assert_allclose(
-        found.extrinsic_covariance, expected.extrinsic_covariance, rtol=1e-4, atol=1e-12
+        solution.extrinsic_covariance, expected.extrinsic_covariance, rtol=1e-4, atol=1e-12
     )
     groups = np.array([[0, 1, 2, 3], [20, 21, 22, 23]])
     np.testing.assert_allclose(
-        found.corner_covariance(groups), expected.corner_covariance(groups), rtol=1e-4, atol=1e-12
+        solution.corner_covariance(groups), expected.corner_covariance(groups), rtol=1e-4, atol=1e-12
     )
-    np.testing.assert_array_equal(found.verdict, expected.verdict)
+    np.testing.assert_array_equal(solution.verdict, expected.verdict)
 
 
 @pytest.mark.parametrize("pose_states", [(), POSE_STATES])
@@ -259,17 +261,17 @@ def test_results_do_not_depend_on_the_number_of_threads(pose_states, monkeypatch
     monkeypatch.setattr("v2hdm.adjust.threads._WORTH_THREADS", 1)
     problem = example()
     options = SolveOptions(pose_states=pose_states)
-    before, found = torch.get_num_threads(), []
+    before, solutions = torch.get_num_threads(), []
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            found.append(solve(problem, options))
+            solutions.append(solve(problem, options))
     finally:
         torch.set_num_threads(before)
-    for one in found[1:]:
-        assert one.cost == found[0].cost
-        np.testing.assert_array_equal(one.corners_map, found[0].corners_map)
-        np.testing.assert_array_equal(one.map_from_vehicle, found[0].map_from_vehicle)
+    for solution in solutions[1:]:
+        assert solution.cost == solutions[0].cost
+        np.testing.assert_array_equal(solution.corners_map, solutions[0].corners_map)
+        np.testing.assert_array_equal(solution.map_from_vehicle, solutions[0].map_from_vehicle)
 
 
 def test_what_is_no_number_stays_none():
@@ -307,11 +309,11 @@ def test_residuals_and_gradients_of_a_solve_by_torch_are_those_of_kornia(monkeyp
 
     monkeypatch.setattr(TorchEngine, "cost_and_gradient", cost_and_gradient)
     options = SolveOptions(pose_states=pose_states, clock_offset=clock, engine="torch")
-    found = solve(example(), options)
-    assert found.status is Status.CONVERGED
-    assert len(evaluated) >= found.evaluations
-    for one in evaluated:
-        assert min(one[name] for name in ("transform_points", "project_points", "exp")) > 0
+    solution = solve(example(), options)
+    assert solution.status is Status.CONVERGED
+    assert len(evaluated) >= solution.evaluations
+    for calls_by_name in evaluated:
+        assert min(calls_by_name[name] for name in ("transform_points", "project_points", "exp")) > 0
     assert calls["project_points"] > len(evaluated)
 
 
@@ -347,13 +349,13 @@ def test_score_tests_are_the_same_by_either_engine():
     problem = make_scene().problem
     numba, by_torch = (
         {
-            (one.fault, one.camera, one.axis, one.item): one
-            for one in score_faults(problem, solve(problem, each))
+            (test.fault, test.camera, test.axis, test.item): test
+            for test in score_faults(problem, solve(problem, options))
         }
-        for each in (SolveOptions(engine="native"), SolveOptions(engine="torch"))
+        for options in (SolveOptions(engine="native"), SolveOptions(engine="torch"))
     )
     assert numba.keys() == by_torch.keys()
-    for key, one in numba.items():
+    for key, test in numba.items():
         np.testing.assert_allclose(
-            [by_torch[key].value, by_torch[key].gain], [one.value, one.gain], rtol=1e-3
+            [by_torch[key].value, by_torch[key].gain], [test.value, test.gain], rtol=1e-3
         )

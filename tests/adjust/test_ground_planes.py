@@ -33,12 +33,14 @@ def test_a_yaw_or_a_place_on_the_plane_is_not_the_grounds_to_tell():
 def few(seed):
     """A straight street with two markings, one of them false: a running board, 35 cm above the ground."""
     scene = make_scene(seed, frames=24, turn_deg_per_m=0.0, every_m=6.0, cameras=1, start_error_deg=0.5)
-    seen = scene.problem.observations
-    cam_from_map = scene.cam_from_vehicle[0] @ np.linalg.inv(scene.map_from_vehicle)[seen.frame]
-    at_px, above_px = (project(cam_from_map, scene.corners_map[seen.corner], z_m) for z_m in (0.0, 0.35))
-    is_false = (seen.corner >= 4) & (seen.corner < 8)
-    moved = replace(seen, pinhole_px=seen.pinhole_px + (above_px - at_px) * is_false[:, None])
-    problem = replace(scene.problem, observations=rows_of(moved, seen.corner < 8), corner_count=8)
+    observations = scene.problem.observations
+    cam_from_map = scene.cam_from_vehicle[0] @ np.linalg.inv(scene.map_from_vehicle)[observations.frame]
+    at_px, above_px = (
+        project(cam_from_map, scene.corners_map[observations.corner], z_m) for z_m in (0.0, 0.35)
+    )
+    is_false = (observations.corner >= 4) & (observations.corner < 8)
+    moved = replace(observations, pinhole_px=observations.pinhole_px + (above_px - at_px) * is_false[:, None])
+    problem = replace(scene.problem, observations=rows_of(moved, observations.corner < 8), corner_count=8)
     return replace(scene, problem=problem, corners_map=scene.corners_map[:8])
 
 

@@ -19,8 +19,8 @@ def street(**changes):
     return make_scene(3, **{"frames": 60, "start_error_deg": 1.0, "min_views": 4, **changes})
 
 
-def part(seen, rows, first=0):
-    return replace(rows_of(seen, rows), corner=seen.corner[rows] - first)
+def part(observations, rows, first=0):
+    return replace(rows_of(observations, rows), corner=observations.corner[rows] - first)
 
 
 def whole_markings(problem):
@@ -44,20 +44,26 @@ def known_beside(problem, truth):
 
 def by_marking(problem):
     """Four corners each, in the order of their numbers, with what the problem knows of them."""
-    seen, out = problem.observations, []
+    observations, out = problem.observations, []
     for first in range(0, problem.corner_count - 3, 4):
-        own = part(seen, np.flatnonzero((seen.corner >= first) & (seen.corner < first + 4)), first)
+        of_marking = part(
+            observations,
+            np.flatnonzero((observations.corner >= first) & (observations.corner < first + 4)),
+            first,
+        )
         lengths, control = problem.lengths, problem.control
         if lengths is not None:
-            one = lengths.first // 4 == first // 4
-            ends = lengths.first[one] - first, lengths.second[one] - first
-            lengths = KnownLengths(*ends, lengths.length_m[one], lengths.sigma_m[one])
+            is_of_marking = lengths.first // 4 == first // 4
+            ends = lengths.first[is_of_marking] - first, lengths.second[is_of_marking] - first
+            lengths = KnownLengths(*ends, lengths.length_m[is_of_marking], lengths.sigma_m[is_of_marking])
         if control is not None:
-            one = control.corner // 4 == first // 4
+            is_of_marking = control.corner // 4 == first // 4
             control = ControlPoints(
-                control.corner[one] - first, control.points_map[one], control.sigma_m[one]
+                control.corner[is_of_marking] - first,
+                control.points_map[is_of_marking],
+                control.sigma_m[is_of_marking],
             )
-        out.append(Sighted(own, lengths, control))
+        out.append(Sighted(of_marking, lengths, control))
     return out
 
 
@@ -123,13 +129,13 @@ def test_a_marking_seen_again_is_re_estimated_from_all_it_was_ever_seen_in():
     problem = whole_markings(street().problem)
     grown, later = IncrementalMap(problem, PAPER), {}
     for marking, sighted in enumerate(by_marking(problem)):
-        seen = sighted.observations
-        early = seen.frame <= np.median(seen.frame)
-        if len(np.unique(seen.corner[early])) < 4 or len(np.unique(seen.corner[~early])) < 4:
+        observations = sighted.observations
+        early = observations.frame <= np.median(observations.frame)
+        if len(np.unique(observations.corner[early])) < 4 or len(np.unique(observations.corner[~early])) < 4:
             early[:] = True
-        grown.observe(marking, Sighted(part(seen, np.flatnonzero(early))))
+        grown.observe(marking, Sighted(part(observations, np.flatnonzero(early))))
         if not early.all():
-            later[marking] = Sighted(part(seen, np.flatnonzero(~early)))
+            later[marking] = Sighted(part(observations, np.flatnonzero(~early)))
     assert len(later) > 5
     for marking, sighted in later.items():
         grown.observe(marking, sighted)
@@ -143,8 +149,8 @@ def test_a_marking_that_cannot_be_re_estimated_stays_as_it_was():
     for marking, sighted in enumerate(markings[:9]):
         grown.observe(marking, sighted)
     before, corners = grown.cam_from_vehicle, grown.corners_map(2)
-    seen = markings[10].observations
-    bad = Sighted(replace(seen, pinhole_px=np.full_like(seen.pinhole_px, np.nan)))
+    observations = markings[10].observations
+    bad = Sighted(replace(observations, pinhole_px=np.full_like(observations.pinhole_px, np.nan)))
     with pytest.raises(AdjustError, match="not finite"):
         grown.observe(2, bad)
     np.testing.assert_array_equal(grown.cam_from_vehicle, before)

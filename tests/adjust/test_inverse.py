@@ -37,7 +37,7 @@ def test_what_is_known_of_the_last_rows_reaches_all_others(whitening):
     whole = root.mT @ root
     tip = len(factor.tip)
     measured = whole[:, -tip:] @ torch.linalg.inv(2 * whole[-tip:, -tip:]) @ whole[-tip:, :]
-    known = whole - measured
-    tiles = inverse_diagonal(factor, whitening.plan.pattern, known[-tip:, -tip:])
-    expected = tiles_of(known, factor)
+    inverse = whole - measured
+    tiles = inverse_diagonal(factor, whitening.plan.pattern, inverse[-tip:, -tip:])
+    expected = tiles_of(inverse, factor)
     np.testing.assert_allclose(tiles, expected, rtol=1e-9, atol=1e-9 * float(expected.max()))

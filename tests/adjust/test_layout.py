@@ -56,8 +56,8 @@ def test_the_covariance_of_corners_that_lengths_join_knows_the_lengths_however_t
     np.testing.assert_allclose(part[1], joint[[2, 3, 0, 1]][:, [2, 3, 0, 1]], rtol=1e-9)
     assert np.linalg.eigvalsh(joint).min() > 0
     for k, sigma_m in enumerate((0.003, 0.004)):
-        apart = solution.corners_map[first[k]] - solution.corners_map[second[k]]
-        direction = apart / np.linalg.norm(apart)
+        difference_m = solution.corners_map[first[k]] - solution.corners_map[second[k]]
+        direction = difference_m / np.linalg.norm(difference_m)
         along = np.zeros(8)
         along[2 * k : 2 * k + 4] = np.concatenate([direction, -direction])
         assert np.sqrt(along @ joint @ along) < sigma_m
@@ -71,14 +71,14 @@ def test_observations_are_sorted_by_corner_and_pair_whatever_was_in_memory(compi
     chosen = rng.choice(cameras * frames * corners, count, replace=False)
     camera, frame, corner = np.unravel_index(chosen, (cameras, frames, corners))
     rank = rng.permutation(corners)
-    seen = Seen.of(
+    sorted_observations = Seen.of(
         (camera, frame, corner, np.zeros((count, 2)), np.tile(np.eye(2), (count, 1, 1))),
         np.ones((cameras, 4)),
     )
     order, rank_of_corner, pair = np.zeros((3, count), dtype=np.int32)
     corner_at = np.zeros(corners + 1, dtype=np.int64)
     with nullcontext() if compiled else native.numpy_alone():
-        repeated = arrange(seen, rank, frames, corner_at, order, rank_of_corner, pair)
+        repeated = arrange(sorted_observations, rank, frames, corner_at, order, rank_of_corner, pair)
     assert repeated == -1
     np.testing.assert_array_equal(order, np.lexsort((frame, camera, rank[corner])))
     np.testing.assert_array_equal(rank_of_corner, rank[corner][order])
@@ -88,11 +88,13 @@ def test_observations_are_sorted_by_corner_and_pair_whatever_was_in_memory(compi
 @pytest.mark.parametrize("compiled", [True, False])
 def test_the_first_observation_that_repeats_another_is_found(compiled):
     camera, frame, corner = np.array([[0, 1, 0, 1, 0], [2, 2, 1, 2, 0], [1, 0, 1, 0, 1]])
-    seen = Seen.of((camera, frame, corner, np.zeros((5, 2)), np.tile(np.eye(2), (5, 1, 1))), np.ones((2, 4)))
+    sorted_observations = Seen.of(
+        (camera, frame, corner, np.zeros((5, 2)), np.tile(np.eye(2), (5, 1, 1))), np.ones((2, 4))
+    )
     order, rank_of_corner, pair = np.zeros((3, 5), dtype=np.int32)
     corner_at = np.zeros(3, dtype=np.int64)
     with nullcontext() if compiled else native.numpy_alone():
-        repeated = arrange(seen, np.arange(2), 3, corner_at, order, rank_of_corner, pair)
+        repeated = arrange(sorted_observations, np.arange(2), 3, corner_at, order, rank_of_corner, pair)
     assert order[repeated - 1 : repeated + 1].tolist() == [1, 3]
 
 
@@ -129,14 +131,14 @@ def test_the_first_transform_that_is_not_rigid_is_found(compiled, wrong):
 @pytest.mark.parametrize("compiled", [True, False])
 def test_observations_of_lines_are_counted_as_they_are_laid_out(compiled):
     problem = make_scene(0, frames=12).problem
-    seen = problem.observations
-    covariance_px = seen.covariance_px.copy()
+    sightings = problem.observations
+    covariance_px = sightings.covariance_px.copy()
     covariance_px[::5, 0, 0] *= 1e5
-    observations = dataclasses.replace(seen, covariance_px=covariance_px)
-    count = len(seen.corner)
+    observations = dataclasses.replace(sightings, covariance_px=covariance_px)
+    count = len(sightings.corner)
     order = np.arange(count, dtype=np.int32)
     frames = len(problem.map_from_vehicle)
-    pair = (seen.camera * frames + seen.frame).astype(np.int32)
+    pair = (sightings.camera * frames + sightings.frame).astype(np.int32)
     with nullcontext() if compiled else native.numpy_alone():
         columns = Seen.of(observations.columns, problem.intrinsic)
         lines = lay_out(columns, order, pair, frames, LINE_EXCESS, np.empty((2, count)), np.empty((3, count)))
@@ -183,11 +185,11 @@ def test_where_the_objective_is_no_number_the_point_before_it_stands(wrong, firs
         return cost, gradient
 
     start_cost, start_gradient = bowl(torch.zeros(3, dtype=torch.float64))
-    found = minimise(objective, start_cost, start_gradient, 1e-12, 30)
-    cost, gradient = bowl(found.whitened)
-    assert found.cost <= start_cost
-    assert found.cost == pytest.approx(cost)
-    torch.testing.assert_close(found.gradient, gradient)
+    minimum = minimise(objective, start_cost, start_gradient, 1e-12, 30)
+    cost, gradient = bowl(minimum.whitened)
+    assert minimum.cost <= start_cost
+    assert minimum.cost == pytest.approx(cost)
+    torch.testing.assert_close(minimum.gradient, gradient)
 
 
 ROOT = Path(__file__).parents[2]
@@ -213,9 +215,9 @@ def said_by(program):
     """The output of a program, which must succeed and say nothing on stderr."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", program]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout.strip()
+    process = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stderr) == (0, "")
+    return process.stdout.strip()
 
 
 def test_torch_does_not_import_its_compiler_but_where_it_has_another_mark_than_we_know():
@@ -258,16 +260,16 @@ print(out)
 
 def test_kernels_are_kept_and_where_they_cannot_be_they_are_compiled(tmp_path):
     """In a folder that is a file, or from damaged files, a process compiles for itself and says nothing."""
-    blocked, kept = tmp_path / "file", tmp_path / "kept"
+    blocked, cache = tmp_path / "file", tmp_path / "kept"
     blocked.write_text("")
     (tmp_path / "own_kernel.py").write_text(OWN_KERNEL)
     assert said_by(KERNEL.format(place=str(blocked), folder=str(tmp_path))) == "[2.]"
-    program = KERNEL.format(place=str(kept), folder=str(tmp_path))
+    program = KERNEL.format(place=str(cache), folder=str(tmp_path))
     assert said_by(program) == "[2.]"
-    stamps = {path: path.stat().st_mtime_ns for path in kept.rglob("*.nb?")}
+    stamps = {path: path.stat().st_mtime_ns for path in cache.rglob("*.nb?")}
     assert stamps
     assert said_by(program) == "[2.]"
-    assert {path: path.stat().st_mtime_ns for path in kept.rglob("*.nb?")} == stamps
+    assert {path: path.stat().st_mtime_ns for path in cache.rglob("*.nb?")} == stamps
     for path in stamps:
         path.write_bytes(b"damaged")
     assert said_by(program) == "[2.]"

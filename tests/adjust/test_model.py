@@ -62,17 +62,17 @@ def residuals(arrays, estimate):
 )
 def test_the_gradient_is_that_of_finite_differences(engine, name, size, pose_states, clock):
     arrays, estimate = example(pose_states, size, clock=clock)
-    made, robust = make_engine(engine, arrays), Loss(name, 3.0)
+    engine_state, robust = make_engine(engine, arrays), Loss(name, 3.0)
     by_torch = make_engine("torch", arrays)
     gradient = factorise(by_torch, by_torch.plan(), estimate, robust).linearised.gradient
     generator = torch.Generator().manual_seed(1)
     parts = (gradient.extrinsic, gradient.frame_state, gradient.corners_map, gradient.clock_s)
     along = [torch.randn(part.shape, generator=generator, dtype=torch.float64) for part in parts]
     cost = [
-        sum(made.terms(moved(estimate, *(sign * 1e-6 * one for one in along)), robust).values())
+        sum(engine_state.terms(moved(estimate, *(sign * 1e-6 * step for step in along)), robust).values())
         for sign in (1.0, -1.0)
     ]
-    expected = sum(float((part * one).sum()) for part, one in zip(parts, along, strict=True))
+    expected = sum(float((part * step).sum()) for part, step in zip(parts, along, strict=True))
     assert (cost[0] - cost[1]) / 2e-6 == pytest.approx(expected, rel=1e-5, abs=1e-3)
 
 
@@ -120,10 +120,10 @@ def test_the_derivative_of_a_known_length_is_the_numerical_one_for_corners_that_
     arrays, estimate = example(())
     corners = apart_m * torch.randn(estimate.corners_map.shape, dtype=torch.float64)
     corners.requires_grad_()
-    known = arrays.lengths
+    lengths = arrays.lengths
 
     def residual(moved):
-        return model.length_residual(arrays, moved[known.first], moved[known.second])
+        return model.length_residual(arrays, moved[lengths.first], moved[lengths.second])
 
     eps = 1e-5 * apart_m
     assert torch.autograd.gradcheck(residual, corners, eps=eps, atol=1e-6, rtol=1e-6)
@@ -174,5 +174,5 @@ def test_the_centre_prior_does_not_mind_a_rotation_about_the_camera():
     arrays, estimate = example(())
     turn = torch.tensor([0, 0, 0, 0.1, -0.2, 0.3], dtype=torch.float64)
     turned = replace(estimate, cam_from_vehicle=model.rigid(turn).detach() @ estimate.cam_from_vehicle)
-    before, after = (model.centre_residual(arrays, one.cam_from_vehicle) for one in (estimate, turned))
+    before, after = (model.centre_residual(arrays, state.cam_from_vehicle) for state in (estimate, turned))
     torch.testing.assert_close(after, before)

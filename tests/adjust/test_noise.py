@@ -14,27 +14,28 @@ STATED = PoseSigma(0.01, 0.001, 0.002, 0.005, roll_pitch_drift=Drift(0.0015, 5.0
 
 def test_a_sigma_that_is_stated_four_times_too_small_is_found():
     street = make_scene(1, frames=120, every_m=3.0, jitter=None, start_error_deg=0.2)
-    rng, seen = np.random.default_rng(1), street.problem.observations
+    rng, observations = np.random.default_rng(1), street.problem.observations
     tangent = np.zeros((120, 6))
     tangent[:, 3:5] = 0.008 * np.column_stack([correlated(rng, 120, 1, 0.9)[:, 0] for _ in range(2)])
-    poses = (street.map_from_vehicle @ exp(tangent))[seen.frame]
+    poses = (street.map_from_vehicle @ exp(tangent))[observations.frame]
     pixel = project(
-        street.cam_from_vehicle[seen.camera] @ np.linalg.inv(poses), street.corners_map[seen.corner]
+        street.cam_from_vehicle[observations.camera] @ np.linalg.inv(poses),
+        street.corners_map[observations.corner],
     )
     pixel += rng.normal(0, 0.7, pixel.shape)
-    problem = replace(street.problem, pose_sigma=STATED, observations=replace(seen, pinhole_px=pixel))
-    (found,) = estimate_noise(problem, solve(problem, SolveOptions(coarse=False, loss="none")))
-    assert found.roll_pitch_rad == pytest.approx(0.008, rel=0.4)
-    assert found.roll_pitch_rad > found.roll_pitch_drift.sigma > 0.003
-    assert found.position_m < STATED.position_m / 2, "these are exact"
+    problem = replace(street.problem, pose_sigma=STATED, observations=replace(observations, pinhole_px=pixel))
+    (noise,) = estimate_noise(problem, solve(problem, SolveOptions(coarse=False, loss="none")))
+    assert noise.roll_pitch_rad == pytest.approx(0.008, rel=0.4)
+    assert noise.roll_pitch_rad > noise.roll_pitch_drift.sigma > 0.003
+    assert noise.position_m < STATED.position_m / 2, "these are exact"
 
 
 def test_a_right_statement_stays():
     street = make_scene(2, frames=120, every_m=3.0, jitter=STATED, start_error_deg=0.2)
     problem = replace(street.problem, pose_sigma=STATED)
-    (found,) = estimate_noise(problem, solve(problem, SolveOptions(coarse=False, loss="none")))
-    assert found.roll_pitch_rad == pytest.approx(STATED.roll_pitch_rad, rel=0.35)
-    assert found.heading_rad == pytest.approx(STATED.heading_rad, rel=0.5)
+    (noise,) = estimate_noise(problem, solve(problem, SolveOptions(coarse=False, loss="none")))
+    assert noise.roll_pitch_rad == pytest.approx(STATED.roll_pitch_rad, rel=0.35)
+    assert noise.heading_rad == pytest.approx(STATED.heading_rad, rel=0.5)
 
 
 def test_without_states_of_the_frames_nothing_is_estimated():

@@ -88,14 +88,16 @@ def test_an_evaluation_of_no_step_is_the_whitening():
 def test_what_one_image_leaves_undetermined_is_damped_as_step_by_step():
     """Corners that one image shows follow any extrinsic, so that nothing is known of it."""
     scene = make_scene(1, frames=20, cameras=1).problem
-    seen = scene.observations
-    frame = np.bincount(seen.frame).argmax()
-    rows = seen.frame == frame
-    _, corner = np.unique(seen.corner[rows], return_inverse=True)
-    columns = {name: getattr(seen, name)[rows] for name in ("camera", "frame", "pinhole_px", "covariance_px")}
+    observations = scene.observations
+    frame = np.bincount(observations.frame).argmax()
+    rows = observations.frame == frame
+    _, corner = np.unique(observations.corner[rows], return_inverse=True)
+    columns = {
+        name: getattr(observations, name)[rows] for name in ("camera", "frame", "pinhole_px", "covariance_px")
+    }
     problem = replace(
         scene,
-        observations=replace(seen, **columns, corner=corner),
+        observations=replace(observations, **columns, corner=corner),
         corner_count=int(corner.max()) + 1,
         centre_vehicle=None,
         centre_sigma_m=None,

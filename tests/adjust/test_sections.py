@@ -10,7 +10,7 @@ from tests.adjust.scene import make_scene, with_ground, with_late_clocks
 from tests.adjust.site import DRIFTING
 from tests.adjust.test_sessions import joined, visited_again
 from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, solve
-from v2hdm.adjust.sections import rounds
+from v2hdm.adjust.sections import rounds, summary
 from v2hdm.adjust.sections.blocks import BlockMatrix, BlockPattern
 from v2hdm.adjust.sections.parts import Part, cut
 from v2hdm.adjust.sections.rounds import Shape, save_part
@@ -54,8 +54,8 @@ def test_drives_along_one_street_are_in_one_part():
 
 def test_a_street_is_cut_where_few_frames_look_across():
     """Two yards of five passes each, 8 m apart, joined by a street of one pass: the cut is in the street."""
-    there = np.column_stack([np.arange(0.0, 100.0, 2.0), np.zeros(50)])
-    passes = np.concatenate([there + np.array([0.0, 8.0 * row]) for row in range(5)])
+    way_map = np.column_stack([np.arange(0.0, 100.0, 2.0), np.zeros(50)])
+    passes = np.concatenate([way_map + np.array([0.0, 8.0 * row]) for row in range(5)])
     street = np.column_stack([np.arange(100.0, 240.0, 2.0), np.zeros(70)])
     position = np.concatenate([passes, street, passes + np.array([240.0, 0.0])])
     session = np.repeat(np.arange(11), [50] * 5 + [70] + [50] * 5)
@@ -103,11 +103,11 @@ def check(results: list[dict], problem: Problem, options: SolveOptions) -> None:
     whole = solve(problem, options)
     every = whole.covariance.corners(np.arange(problem.corner_count)[:, None])
     poses = whole.covariance.poses()
-    seen = np.zeros(problem.corner_count, dtype=bool)
+    is_covered = np.zeros(problem.corner_count, dtype=bool)
     for result in results:
         part: Part = result["part"]
         solution = result["solution"]
-        seen[part.corners] = True
+        is_covered[part.corners] = True
         np.testing.assert_allclose(solution.corners_map, whole.corners_map[part.corners], atol=1e-5)
         np.testing.assert_allclose(solution.map_from_vehicle, whole.map_from_vehicle[part.frames], atol=1e-5)
         cameras = whole.cam_from_vehicle[part.cameras]
@@ -120,7 +120,7 @@ def check(results: list[dict], problem: Problem, options: SolveOptions) -> None:
         extrinsic = whole.extrinsic_covariance[part.cameras]
         np.testing.assert_allclose(result["extrinsic"], extrinsic, rtol=5e-3, atol=1e-12)
         np.testing.assert_allclose(result["poses"], poses[part.frames], rtol=2e-3, atol=1e-14)
-    assert seen.all()
+    assert is_covered.all()
 
 
 def test_sections_of_a_street_are_the_street(tmp_path):
@@ -147,13 +147,17 @@ def test_sections_that_start_near_their_joint_optimum_are_the_street(tmp_path):
     scene = make_scene(3, frames=100, jitter=DRIFTING, outliers=0.03, start_error_deg=0.5)
     options = SolveOptions()
     rough = solve(scene.problem, replace(options, gap_tolerance=1e-3))
-    near = replace(
+    near_optimum = replace(
         scene.problem,
         cam_from_vehicle=rough.cam_from_vehicle,
         poses_start=rough.map_from_vehicle,
         corners_start=rough.corners_map,
     )
-    check(in_sections(tmp_path, near, options, np.arange(100) // 50, are_near=True), scene.problem, options)
+    check(
+        in_sections(tmp_path, near_optimum, options, np.arange(100) // 50, are_near=True),
+        scene.problem,
+        options,
+    )
 
 
 def test_sections_without_frame_states_are_the_street(tmp_path):
@@ -280,3 +284,31 @@ def test_a_single_section_is_the_street(tmp_path):
     options = SolveOptions()
     part = np.zeros(60, dtype=np.int64)
     check(in_sections(tmp_path, scene.problem, options, part), scene.problem, options)
+
+
+def compare_pairs(number, part, solution):
+    """Covariances of groups of which some are known, beside those of groups that are asked for."""
+    covariance = solution.covariance
+    groups = np.arange(part.problem.corner_count // 3 * 3).reshape(-1, 3)[::-1]
+    # Every third group is not known, and one corner stands twice in a group.
+    groups[0, 1] = groups[0, 0]
+    known = groups[np.arange(len(groups)) % 3 > 0]
+    first, second = np.broadcast_arrays(known[:, :, None], known[:, None, :])
+    knowing = covariance.with_pairs(first.ravel(), second.ravel())
+    return knowing.corners(groups), covariance.corners(groups), knowing.pairs.of_groups(known).is_known
+
+
+@pytest.mark.parametrize("states", [("roll", "pitch"), ()])
+def test_covariances_of_pairs_are_those_of_groups(tmp_path, monkeypatch, states):
+    """Also where the corners of a pair are solved for one after the other, as in a long section."""
+    monkeypatch.setattr(summary, "_CORNERS_AT_ONCE", 7)
+    scene = make_scene(3, frames=100, jitter=DRIFTING if states else None, start_error_deg=0.5)
+    options = SolveOptions(pose_states=states)
+    parts, links = cut(scene.problem, np.arange(100) // 50, states)
+    for number, part in enumerate(parts):
+        save_part(tmp_path, number, part)
+    shape = Shape.of(scene.problem, options)
+    joint = join_parts(tmp_path, 2, links, shape, lambda number, part, solution: None)
+    for known, asked, is_known in finish_parts(tmp_path, joint, shape, compare_pairs):
+        assert is_known.all()
+        np.testing.assert_allclose(known, asked, rtol=1e-8, atol=1e-14)

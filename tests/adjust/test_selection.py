@@ -24,8 +24,8 @@ STILL = PoseSigma(position_m=1e-5, heading_rad=1e-6, roll_pitch_rad=1e-6, height
 )
 def test_the_model_is_chosen_that_made_the_drive(jitter, expected):
     scene = make_scene(30, frames=60, jitter=jitter, start_error_deg=0.2, start_error_m=0.01)
-    told = replace(scene.problem, pose_sigma=PoseSigma(position_m=0.03, heading_rad=0.003, height_m=0.03))
-    selection = select_model(told, SolveOptions(loss_scale=2.0), ("paper", "roll_pitch", "full", "heave"))
+    stated = replace(scene.problem, pose_sigma=PoseSigma(position_m=0.03, heading_rad=0.003, height_m=0.03))
+    selection = select_model(stated, SolveOptions(loss_scale=2.0), ("paper", "roll_pitch", "full", "heave"))
     assert selection.name in expected
     assert set(selection.scores) == {"paper", "roll_pitch", "full", "heave"}
     assert repr(selection.name) in selection.sentence
@@ -46,14 +46,14 @@ def test_a_clock_needs_the_vehicles_motion_and_is_else_left_out():
 def test_a_clock_offset_is_estimated_where_there_is_one(late_s, expected):
     scene = make_scene(35, frames=50, turn_deg_per_m=8.0, start_error_deg=0.2, start_error_m=0.01)
     problem = with_late_clocks(scene, np.array([late_s, 0.0])).problem
-    told = replace(problem, pose_sigma=PoseSigma(0.01, 0.0005, 0.001, 0.003))
-    assert select_model(told, SolveOptions(), ("heave", "clock")).name == expected
+    stated = replace(problem, pose_sigma=PoseSigma(0.01, 0.0005, 0.001, 0.003))
+    assert select_model(stated, SolveOptions(), ("heave", "clock")).name == expected
 
 
 def test_too_few_observations_leave_the_richest_model():
     problem = make_scene(34, frames=6, start_error_deg=0.2).problem
-    seen = problem.observations
-    part, _ = restrict(problem, seen.frame < 2)
+    observations = problem.observations
+    part, _ = restrict(problem, observations.frame < 2)
     selection = select_model(part, SolveOptions())
     assert (selection.name, selection.scores) == ("heave", {})
     assert "too few observations" in selection.sentence
@@ -61,13 +61,13 @@ def test_too_few_observations_leave_the_richest_model():
 
 def test_a_part_of_a_problem_has_the_residuals_of_the_whole():
     problem = make_scene(33, frames=40, start_error_deg=0.5).problem
-    seen = problem.observations
-    keep = (seen.frame >= 10) & (seen.frame < 30)
-    keep &= np.bincount(seen.corner[keep], minlength=problem.corner_count)[seen.corner] >= 2
+    observations = problem.observations
+    keep = (observations.frame >= 10) & (observations.frame < 30)
+    keep &= np.bincount(observations.corner[keep], minlength=problem.corner_count)[observations.corner] >= 2
     part, corners = restrict(problem, keep)
     assert len(part.map_from_vehicle) <= 20
     assert part.corner_count == len(corners)
-    np.testing.assert_array_equal(corners[part.observations.corner], seen.corner[keep])
+    np.testing.assert_array_equal(corners[part.observations.corner], observations.corner[keep])
     assert solve(part, SolveOptions(pose_states=(), loss="none")).chi2_per_dof == pytest.approx(1, abs=0.15)
 
 
@@ -93,10 +93,10 @@ def test_what_is_said_of_the_centre_holds():
     scene = make_scene(2, frames=60, turn_deg_per_m=0.0, cameras=1)
     solution = solve(scene.problem)
     (camera,) = observability(scene.problem, solution)
-    truth, found = (
+    truth, estimated = (
         -m[0, :3, :3].T @ m[0, :3, 3] for m in (scene.cam_from_vehicle, solution.cam_from_vehicle)
     )
-    assert np.all(np.abs(found - truth) < 4 * camera.sigma[:3])
+    assert np.all(np.abs(estimated - truth) < 4 * camera.sigma[:3])
 
 
 def test_wrong_associations_are_contradicted_and_few_others_are():
@@ -111,11 +111,11 @@ def test_wrong_associations_are_contradicted_and_few_others_are():
 
 def test_of_two_observations_that_disagree_neither_is_believed():
     problem = make_scene(8, frames=40, jitter=PoseSigma()).problem
-    seen = problem.observations
-    mine = np.flatnonzero(seen.corner == 20)
-    keep = np.ones(len(seen.corner), dtype=bool)
+    observations = problem.observations
+    mine = np.flatnonzero(observations.corner == 20)
+    keep = np.ones(len(observations.corner), dtype=bool)
     keep[mine[1:-1]] = False
-    pair = replace(problem, observations=rows_of(seen, keep))
+    pair = replace(problem, observations=rows_of(observations, keep))
     assert solve(pair).accepted[pair.observations.corner == 20].all()
     moved = pair.observations.pinhole_px.copy()
     first, second = np.flatnonzero(pair.observations.corner == 20)

@@ -30,14 +30,14 @@ def rolling(read_out_s: np.ndarray, speed_mps: float = 10.0, noise: float = PIXE
     the pixel, until nothing changes.
     """
     scene = with_late_clocks(make_scene(**street), np.zeros(2))
-    problem, seen = scene.problem, scene.problem.observations
+    problem, observations = scene.problem, scene.problem.observations
     twist = problem.twist_vehicle * (speed_mps / 6.0)
-    poses, truth = problem.map_from_vehicle[seen.frame], scene.cam_from_vehicle[seen.camera]
-    pixel = seen.pinhole_px
+    poses, truth = problem.map_from_vehicle[observations.frame], scene.cam_from_vehicle[observations.camera]
+    pixel = observations.pinhole_px
     for _ in range(30):
-        late_s = read_out_s[seen.camera] * share_of(pixel[:, 1])
-        then = poses @ exp(twist[seen.frame] * late_s[:, None])
-        pixel = project(truth @ np.linalg.inv(then), scene.corners_map[seen.corner])
+        late_s = read_out_s[observations.camera] * share_of(pixel[:, 1])
+        then = poses @ exp(twist[observations.frame] * late_s[:, None])
+        pixel = project(truth @ np.linalg.inv(then), scene.corners_map[observations.corner])
     share = share_of(pixel[:, 1])
     pixel = pixel + noise * np.random.default_rng(5).standard_normal(pixel.shape)
     return replace(
@@ -45,7 +45,7 @@ def rolling(read_out_s: np.ndarray, speed_mps: float = 10.0, noise: float = PIXE
         problem=replace(
             problem,
             twist_vehicle=twist,
-            observations=replace(seen, pinhole_px=pixel, row_share=share),
+            observations=replace(observations, pinhole_px=pixel, row_share=share),
             read_out_s=read_out_s,
         ),
     )
@@ -60,36 +60,37 @@ def test_the_residual_is_that_of_each_row_s_own_pose(name):
     """The poses err, the clock is off, and the read-out time is not the stated one."""
     scene = rolling(READ_OUT_S, **STREET)
     problem = replace(scene.problem, read_out_s=READ_OUT_S - 0.01)
-    seen, rng = problem.observations, np.random.default_rng(1)
+    observations, rng = problem.observations, np.random.default_rng(1)
     arrays = make_arrays(problem, POSE_STATES, "cpu", True, True)
     state, late_s = rng.normal(0, 0.01, (80, 6)), np.array([[0.004], [-0.003]])
     estimate = Estimate(
-        *(torch.as_tensor(one) for one in (scene.cam_from_vehicle, state, scene.corners_map)),
+        *(torch.as_tensor(array) for array in (scene.cam_from_vehicle, state, scene.corners_map)),
         torch.as_tensor(np.column_stack([late_s, [0.01, 0.01]])),
     )
     corners = replace(estimate, corners_map=estimate.corners_map[arrays.corner_order])
     residual_px, _, _ = make_engine(name, arrays).report(corners, problem.intrinsic[:, :2])
-    for k in rng.integers(0, len(seen.frame), 200):
-        c, j = seen.camera[k], seen.frame[k]
-        time_s = late_s[c, 0] + READ_OUT_S[c] * seen.row_share[k]
+    for k in rng.integers(0, len(observations.frame), 200):
+        c, j = observations.camera[k], observations.frame[k]
+        time_s = late_s[c, 0] + READ_OUT_S[c] * observations.row_share[k]
         pose = problem.map_from_vehicle[j] @ exp(state[j]) @ exp(problem.twist_vehicle[j] * time_s)
         expected = project(
-            (scene.cam_from_vehicle[c] @ np.linalg.inv(pose))[None], scene.corners_map[[seen.corner[k]]]
+            (scene.cam_from_vehicle[c] @ np.linalg.inv(pose))[None],
+            scene.corners_map[[observations.corner[k]]],
         )
-        np.testing.assert_allclose(residual_px[k], expected[0] - seen.pinhole_px[k], atol=1e-8)
+        np.testing.assert_allclose(residual_px[k], expected[0] - observations.pinhole_px[k], atol=1e-8)
 
 
 def test_a_known_read_out_time_costs_no_accuracy():
     """30 ms at 10 m/s: corners as of a global shutter; a mapper that does not know of it is far off."""
-    known = rolling(np.array([0.03, 0.03]), **STREET)
+    stated = rolling(np.array([0.03, 0.03]), **STREET)
     still = rolling(np.zeros(2), **STREET)
-    found, expected = solve(known.problem, PAPER), solve(still.problem, PAPER)
-    ignorant = solve(replace(known.problem, read_out_s=None), PAPER)
-    assert found.status is Status.CONVERGED
-    rmse_m = known.corner_rmse_m(found.corners_map)
+    solution, expected = solve(stated.problem, PAPER), solve(still.problem, PAPER)
+    ignorant = solve(replace(stated.problem, read_out_s=None), PAPER)
+    assert solution.status is Status.CONVERGED
+    rmse_m = stated.corner_rmse_m(solution.corners_map)
     assert rmse_m < 1.1 * still.corner_rmse_m(expected.corners_map)
-    assert known.corner_rmse_m(ignorant.corners_map) > 2 * rmse_m
-    np.testing.assert_array_equal(found.read_out_s, [0.03, 0.03])
+    assert stated.corner_rmse_m(ignorant.corners_map) > 2 * rmse_m
+    np.testing.assert_array_equal(solution.read_out_s, [0.03, 0.03])
 
 
 @pytest.mark.parametrize("true_s", [READ_OUT_S, np.zeros(2)], ids=["rolling", "global"])
@@ -97,24 +98,24 @@ def test_a_known_read_out_time_costs_no_accuracy():
 def test_an_estimated_read_out_time_is_the_true_one(engine, true_s):
     scene = rolling(true_s, **STREET)
     unknown = replace(scene.problem, read_out_s=None)
-    found = solve(unknown, replace(PAPER, read_out=True, engine=engine))
-    sigma_s = np.sqrt(found.covariance.clock_s2()[:, -1])
-    assert found.status is Status.CONVERGED
-    assert (np.abs(found.read_out_s - true_s) < 1e-3).all()
-    assert (np.abs(found.read_out_s - true_s) < 3 * sigma_s).all()
+    solution = solve(unknown, replace(PAPER, read_out=True, engine=engine))
+    sigma_s = np.sqrt(solution.covariance.clock_s2()[:, -1])
+    assert solution.status is Status.CONVERGED
+    assert (np.abs(solution.read_out_s - true_s) < 1e-3).all()
+    assert (np.abs(solution.read_out_s - true_s) < 3 * sigma_s).all()
     assert (sigma_s < 5e-4).all()
-    assert (found.clock_offset_s == 0).all()
+    assert (solution.clock_offset_s == 0).all()
 
 
 def test_a_read_out_time_is_found_beside_clocks_and_pose_errors():
     poses = PoseSigma(0.01, 0.0005, 0.001, 0.005)
     scene = rolling(READ_OUT_S, **STREET)
     problem = replace(scene.problem, read_out_s=np.zeros(2), clock_sigma_s=0.05, pose_sigma=poses)
-    found = solve(problem, SolveOptions(clock_offset=True, read_out=True))
-    sigma_s = np.sqrt(found.covariance.clock_s2())
+    solution = solve(problem, SolveOptions(clock_offset=True, read_out=True))
+    sigma_s = np.sqrt(solution.covariance.clock_s2())
     assert sigma_s.shape == (2, 2)
-    assert (np.abs(found.read_out_s - READ_OUT_S) < 3 * sigma_s[:, 1]).all()
-    assert (np.abs(found.clock_offset_s[:, 0]) < 3 * sigma_s[:, 0]).all()
+    assert (np.abs(solution.read_out_s - READ_OUT_S) < 3 * sigma_s[:, 1]).all()
+    assert (np.abs(solution.clock_offset_s[:, 0]) < 3 * sigma_s[:, 0]).all()
 
 
 def test_a_coarse_start_knows_the_read_out_time():

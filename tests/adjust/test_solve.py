@@ -28,7 +28,7 @@ def reference_optimum(scene):
     """The least cost that scipy finds from the truth."""
 
     def residuals(x):
-        return np.concatenate([one.ravel() for one in reference_residuals(scene.problem, x).values()])
+        return np.concatenate([part.ravel() for part in reference_residuals(scene.problem, x).values()])
 
     exact = {"jac": "3-point", "x_scale": "jac", "ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15}
     return float(least_squares(residuals, truth_of(scene), **exact).cost)
@@ -48,8 +48,8 @@ def test_the_cost_is_that_of_an_independent_least_squares_solver_to_nine_digits(
     rng = np.random.default_rng(0)
     scene = make_scene(1, frames=12, step_m=1.2, jitter=POSES, every_m=3.0)
     root = rng.normal(0, 0.4, (len(scene.problem.observations.corner), 2, 2)) + 0.8 * np.eye(2)
-    seen = replace(scene.problem.observations, covariance_px=root @ root.transpose(0, 2, 1))
-    scene = replace(scene, problem=replace(scene.problem, observations=seen))
+    observations = replace(scene.problem.observations, covariance_px=root @ root.transpose(0, 2, 1))
+    scene = replace(scene, problem=replace(scene.problem, observations=observations))
     if sigma_m is not None:
         scene = replace(scene, problem=replace(scene.problem, lengths=sides(scene, sigma_m, 0.01)))
     solution = solve(scene.problem, SolveOptions(loss="none"))
@@ -62,8 +62,8 @@ def test_the_cost_is_that_of_an_independent_least_squares_solver_to_nine_digits(
 @pytest.mark.parametrize("turn_deg_per_m", [0.0, 4.0])
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_the_papers_model_recovers_a_street_with_perfect_poses(start_error_deg, turn_deg_per_m, cameras):
-    given = {"start_error_deg": start_error_deg, "turn_deg_per_m": turn_deg_per_m, "cameras": cameras}
-    scene = make_scene(5, frames=70, prior_sigma_m=0.005, start_error_m=0.3, **given)
+    settings = {"start_error_deg": start_error_deg, "turn_deg_per_m": turn_deg_per_m, "cameras": cameras}
+    scene = make_scene(5, frames=70, prior_sigma_m=0.005, start_error_m=0.3, **settings)
     solution = solve(scene.problem, PAPER)
     assert solution.status is Status.CONVERGED
     assert scene.corner_rmse_m(solution.corners_map) < 0.02
@@ -110,17 +110,17 @@ def test_knowing_that_rtk_errors_drift_slowly_helps():
 
 def test_a_second_lap_over_the_same_markings_joins_the_first():
     scene = make_scene(9, frames=50, step_m=0.8, jitter=POSES)
-    seen, again = scene.problem.observations, make_scene(9, frames=50, step_m=0.8, jitter=POSES)
-    noise = np.random.default_rng(1).normal(0, 0.7, seen.pinhole_px.shape)
-    both = Observations(
-        np.tile(seen.camera, 2),
-        np.concatenate([seen.frame, seen.frame + 50]),
-        np.tile(seen.corner, 2),
-        np.concatenate([seen.pinhole_px, again.problem.observations.pinhole_px + noise]),
-        np.tile(seen.covariance_px, (2, 1, 1)),
+    observations, again = scene.problem.observations, make_scene(9, frames=50, step_m=0.8, jitter=POSES)
+    noise = np.random.default_rng(1).normal(0, 0.7, observations.pinhole_px.shape)
+    of_both_laps = Observations(
+        np.tile(observations.camera, 2),
+        np.concatenate([observations.frame, observations.frame + 50]),
+        np.tile(observations.corner, 2),
+        np.concatenate([observations.pinhole_px, again.problem.observations.pinhole_px + noise]),
+        np.tile(observations.covariance_px, (2, 1, 1)),
     )
     poses = np.tile(scene.problem.map_from_vehicle, (2, 1, 1))
-    solution = solve(replace(scene.problem, observations=both, map_from_vehicle=poses))
+    solution = solve(replace(scene.problem, observations=of_both_laps, map_from_vehicle=poses))
     assert solution.status is Status.CONVERGED
     assert scene.corner_rmse_m(solution.corners_map) < 0.02
 
@@ -130,9 +130,9 @@ def test_the_same_problem_gives_the_same_bits_and_another_order_the_same_optimum
     first, second = solve(problem), solve(problem)
     assert np.array_equal(first.corners_map, second.corners_map)
     assert np.array_equal(first.cam_from_vehicle, second.cam_from_vehicle)
-    seen = problem.observations
-    order = np.random.default_rng(0).permutation(len(seen.corner))
-    third = solve(replace(problem, observations=rows_of(seen, order)))
+    observations = problem.observations
+    order = np.random.default_rng(0).permutation(len(observations.corner))
+    third = solve(replace(problem, observations=rows_of(observations, order)))
     np.testing.assert_allclose(third.corners_map, first.corners_map, atol=1e-9)
     np.testing.assert_allclose(third.mahalanobis2, first.mahalanobis2[order], atol=1e-6)
     np.testing.assert_allclose(third.residual_px, first.residual_px[order], atol=1e-6)
@@ -142,8 +142,8 @@ def test_the_residuals_are_projected_minus_observed_pixels():
     scene = make_scene(11, frames=40, pixel_sigma=0.0, start_error_deg=0.5)
     moved = scene.problem.observations.pinhole_px.copy()
     moved[17] += [0.0, 5.0]
-    seen = replace(scene.problem.observations, pinhole_px=moved)
-    problem = replace(scene.problem, observations=seen, centre_vehicle=None, centre_sigma_m=None)
+    observations = replace(scene.problem.observations, pinhole_px=moved)
+    problem = replace(scene.problem, observations=observations, centre_vehicle=None, centre_sigma_m=None)
     solution = solve(problem, SolveOptions(pose_states=(), loss="geman_mcclure"))
     np.testing.assert_allclose(solution.residual_px[17], [0, -5], atol=0.1)
     assert np.delete(np.abs(solution.residual_px), 17, axis=0).max() < 0.1
@@ -152,8 +152,8 @@ def test_the_residuals_are_projected_minus_observed_pixels():
 def test_the_corners_may_be_given_a_start():
     scene = make_scene(12, frames=40)
     problem = replace(scene.problem, corners_start=scene.corners_map)
-    free, given = solve(scene.problem, PAPER), solve(problem, replace(PAPER, coarse=False))
-    assert given.cost == pytest.approx(free.cost, rel=1e-9)
+    free, from_start = solve(scene.problem, PAPER), solve(problem, replace(PAPER, coarse=False))
+    assert from_start.cost == pytest.approx(free.cost, rel=1e-9)
 
 
 def test_a_newton_step_of_the_cameras_leads_to_a_start_from_which_few_evaluations_do():
@@ -179,14 +179,14 @@ def test_a_camera_whose_clock_is_late_is_found_out():
     offset_s = np.array([0.03, -0.01])
     scene = with_late_clocks(make_scene(14, frames=80, turn_deg_per_m=8.0, prior_sigma_m=0.01), offset_s)
     problem = scene.problem
-    punctual, found = solve(problem, PAPER), solve(problem, replace(PAPER, clock_offset=True))
-    assert found.status is Status.CONVERGED
-    sigma_s = np.sqrt(found.covariance.clock_s2())
+    punctual, with_clocks = solve(problem, PAPER), solve(problem, replace(PAPER, clock_offset=True))
+    assert with_clocks.status is Status.CONVERGED
+    sigma_s = np.sqrt(with_clocks.covariance.clock_s2())
     assert np.all(sigma_s < 0.002)
-    assert np.all(np.abs(found.clock_offset_s - offset_s[:, None]) < 4 * sigma_s)
-    assert found.chi2_per_dof == pytest.approx(1, abs=0.05)
+    assert np.all(np.abs(with_clocks.clock_offset_s - offset_s[:, None]) < 4 * sigma_s)
+    assert with_clocks.chi2_per_dof == pytest.approx(1, abs=0.05)
     assert punctual.chi2_per_dof > 1.2
-    assert scene.corner_rmse_m(found.corners_map) < 0.5 * scene.corner_rmse_m(punctual.corners_map)
+    assert scene.corner_rmse_m(with_clocks.corners_map) < 0.5 * scene.corner_rmse_m(punctual.corners_map)
 
 
 def test_two_control_points_undo_the_drift_of_the_receiver():
@@ -207,12 +207,14 @@ def test_two_control_points_undo_the_drift_of_the_receiver():
 def far_marking(seed):
     """A street on which one diamond, the corners that are returned, is only seen from beyond 18 m."""
     scene = make_scene(seed, frames=60, max_range_m=30.0, cameras=1, prior_sigma_m=0.005, start_error_deg=1.0)
-    seen, corners = scene.problem.observations, scene.corners_map
-    apart = np.linalg.norm(corners[seen.corner] - scene.map_from_vehicle[seen.frame, :2, 3], axis=1)
+    observations, corners = scene.problem.observations, scene.corners_map
+    range_m = np.linalg.norm(
+        corners[observations.corner] - scene.map_from_vehicle[observations.frame, :2, 3], axis=1
+    )
     whole = [k for k in range(40, len(corners) - 3) if np.ptp(corners[k : k + 4], axis=0).max() < 0.75]
     mine = np.arange(whole[0], whole[0] + 4)
-    keep = ~np.isin(seen.corner, mine) | (apart > 18)
-    return replace(scene, problem=replace(scene.problem, observations=rows_of(seen, keep))), mine
+    keep = ~np.isin(observations.corner, mine) | (range_m > 18)
+    return replace(scene, problem=replace(scene.problem, observations=rows_of(observations, keep))), mine
 
 
 def test_known_sizes_make_a_far_marking_better_and_its_covariance_says_how_much():
@@ -223,15 +225,17 @@ def test_known_sizes_make_a_far_marking_better_and_its_covariance_says_how_much(
         length_m = np.linalg.norm(scene.corners_map[first] - scene.corners_map[second], axis=1)
         told_m = length_m + np.random.default_rng(seed).normal(0, 0.002, 5)
         lengths = KnownLengths(first, second, told_m, np.full(5, 0.002))
-        plain, known = (solve(replace(scene.problem, lengths=given), PAPER) for given in (None, lengths))
-        assert known.status is Status.CONVERGED
-        error = (known.corners_map - scene.corners_map)[mine]
+        plain, with_lengths = (
+            solve(replace(scene.problem, lengths=known_lengths), PAPER) for known_lengths in (None, lengths)
+        )
+        assert with_lengths.status is Status.CONVERGED
+        error = (with_lengths.corners_map - scene.corners_map)[mine]
         free.append(np.mean((plain.corners_map - scene.corners_map)[mine] ** 2))
         tied.append(np.mean(error**2))
-        covariance = known.corner_covariance(mine)
+        covariance = with_lengths.corner_covariance(mine)
         surprise.append(error.ravel() @ np.linalg.solve(covariance, error.ravel()))
         # A corner alone says the same as within its marking, whatever it is tied to.
-        alone = known.corner_covariance(mine[[2]])
+        alone = with_lengths.corner_covariance(mine[[2]])
         np.testing.assert_allclose(alone, covariance[4:6, 4:6], rtol=1e-6)
         direction = (scene.corners_map[mine[0]] - scene.corners_map[mine[2]]) / length_m[4]
         along = np.concatenate([direction, 0 * direction, -direction, 0 * direction])

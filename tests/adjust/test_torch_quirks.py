@@ -20,8 +20,8 @@ print("torch._dynamo" in sys.modules)
 def compiler_is_imported(before=""):
     """Whether a process that makes its first optimiser imports torch's compiler."""
     program = FIRST_OPTIMISER.format(before=before)
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    return done.stdout.strip() == "True"
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return process.stdout.strip() == "True"
 
 
 def test_the_first_optimiser_imports_torchs_compiler_unless_it_is_left_out():

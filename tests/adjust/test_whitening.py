@@ -143,8 +143,8 @@ def test_covariances_agree_with_the_scatter_of_many_solves():
         off = last.cam_from_vehicle[0, :3, :3] @ scene.cam_from_vehicle[0, :3, :3].T
         extrinsics.append([off[2, 1], off[0, 2], off[1, 0]])
     stated = np.diag(last.corner_covariance(mark))
-    found = np.mean(np.square(corners), axis=0)
-    assert np.mean(found / stated) == pytest.approx(1, abs=0.3)
+    scatter = np.mean(np.square(corners), axis=0)
+    assert np.mean(scatter / stated) == pytest.approx(1, abs=0.3)
     rotation = np.diag(last.extrinsic_covariance[0])[3:]
     np.testing.assert_allclose(np.mean(np.square(extrinsics), axis=0) / rotation, 1, atol=0.6)
 

@@ -16,7 +16,9 @@ from v2hdm.store import names
 def site(tmp_path, monkeypatch):
     """A map, its design, and one whose row 2 is painted 9 cm aside."""
     design = layout()
-    aside = [moved(one, 0, 0.09) if one.name.startswith("lane_dash 2/") else one for one in design.shapes]
+    aside = [
+        moved(shape, 0, 0.09) if shape.name.startswith("lane_dash 2/") else shape for shape in design.shapes
+    ]
     write_geojson(mapped(design.shapes, 1), tmp_path / "map.geojson")
     write_geojson(mapped(aside, 2), tmp_path / "aside.geojson")
     monkeypatch.chdir(tmp_path)
@@ -59,8 +61,8 @@ def test_rules_take_the_place_of_a_design(site, capsys):
     ("words", "says"),
     [
         (["map.geojson", "nothing.geojson"], "nothing.geojson"),
-        (["map.geojson", "map.txt"], "is no design that can be read"),
-        (["map.geojson", "map.geojson", "--tolerance", "0"], "--tolerance 0: is no tolerance in m"),
+        (["map.geojson", "map.txt"], "is not a readable design"),
+        (["map.geojson", "map.geojson", "--tolerance", "0"], "--tolerance 0: is not a tolerance in m"),
         (["map.geojson", "map.geojson", "--class", "a"], "--class a: give it as NAME=CLASS"),
         (["nothing", "map.geojson"], "nothing"),
     ],

@@ -46,10 +46,12 @@ def test_decisions_outside_the_guard_band_are_right_for_paint_that_is_off_by_kno
         if abs(off_m - TOLERANCE.place_m) > 0.035:  # by four sigmas of the map
             clear.add(shape.name)
     comparison = compare_with_design(mapped(painted, seed), design, TOLERANCE)
-    decided_ones = [one for one in comparison.findings if one.fate in (Fate.RIGHT, Fate.OFF)]
-    wrong = [one.name for one in decided_ones if (one.fate is Fate.RIGHT) != conforms[one.name]]
+    decided_ones = [finding for finding in comparison.findings if finding.fate in (Fate.RIGHT, Fate.OFF)]
+    wrong = [
+        finding.name for finding in decided_ones if (finding.fate is Fate.RIGHT) != conforms[finding.name]
+    ]
     assert not wrong
-    assert clear <= {one.name for one in decided_ones}
+    assert clear <= {finding.name for finding in decided_ones}
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -79,7 +81,7 @@ def test_a_row_that_is_painted_aside_is_off_and_its_neighbours_are_not():
     comparison = compare_with_design(mapped(painted, 3), design, TOLERANCE)
     off = {name for name, fate in fates(comparison).items() if fate is Fate.OFF}
     assert off == {shape.name for shape in design.shapes if shape.name.startswith("lane_dash 2/")}
-    (finding,) = [one for one in comparison.findings if one.name == "lane_dash 2/7"]
+    (finding,) = [finding for finding in comparison.findings if finding.name == "lane_dash 2/7"]
     across = next(quantity for quantity in finding.quantities if quantity.name == "across")
     assert abs(across.value) == pytest.approx(0.09, abs=3 * across.sigma + 0.002)
 
@@ -96,12 +98,14 @@ def test_a_dash_that_is_too_short_is_named_by_its_length_unless_one_end_may_be_m
         for shape in design.shapes
     ]
     comparison = compare_with_design(mapped(painted, 4), design, TOLERANCE)
-    found = {finding.name: finding for finding in comparison.findings}
-    assert found["lane_dash 0/3"].fate is Fate.OFF
-    length = next(one for one in found["lane_dash 0/3"].quantities if one.name == "length")
+    finding_of = {finding.name: finding for finding in comparison.findings}
+    assert finding_of["lane_dash 0/3"].fate is Fate.OFF
+    length = next(
+        quantity for quantity in finding_of["lane_dash 0/3"].quantities if quantity.name == "length"
+    )
     assert length.fate is Fate.OFF
     assert length.value == pytest.approx(-0.3, abs=0.03)
-    assert found["lane_dash 4/9"].fate is Fate.UNSURE
+    assert finding_of["lane_dash 4/9"].fate is Fate.UNSURE
 
 
 def test_markings_that_the_design_does_not_have_are_extra():
@@ -129,9 +133,9 @@ def ground(shapes, hidden=()):
 def test_a_shape_is_missing_where_the_ground_is_bare_and_not_inspected_where_nothing_shows_it():
     design = layout()
     gone, hidden, unmapped = (design.shapes[k] for k in (7, 30, 45))
-    rest = [shape for shape in design.shapes if shape not in (gone, hidden, unmapped)]
-    mosaic = ground([*rest, unmapped], hidden=[hidden])
-    comparison = compare_with_design(mapped(rest, 6), design, TOLERANCE, mosaic)
+    painted = [shape for shape in design.shapes if shape not in (gone, hidden, unmapped)]
+    mosaic = ground([*painted, unmapped], hidden=[hidden])
+    comparison = compare_with_design(mapped(painted, 6), design, TOLERANCE, mosaic)
     fate_of = fates(comparison)
     assert fate_of[gone.name] is Fate.MISSING
     assert fate_of[hidden.name] is fate_of[unmapped.name] is Fate.NOT_INSPECTED

@@ -100,11 +100,11 @@ def test_a_geopackage_of_other_programs_is_in_the_system_of_its_layer(tmp_path, 
 
 def test_names_that_are_no_classes_are_left_out_unless_they_are_explained(tmp_path, hd_map, caplog):
     path = foreign(tmp_path / "a.geojson", hd_map, Class="MARK 02")
-    with pytest.raises(MapFileError, match=r"no classes: 'MARK 02' .18.; --class NAME=CLASS"):
+    with pytest.raises(MapFileError, match=r"unknown classes: 'MARK 02' .18.; --class NAME=CLASS"):
         read_design(path, hd_map)
     design = read_design(path, hd_map, Source(kinds={"MARK 02": "diamond"}))
     assert {shape.kind for shape in design.shapes} == {"diamond"}
-    with pytest.raises(ConfigError, match="--class MARK 02='diamnd': is no class; choose from"):
+    with pytest.raises(ConfigError, match="--class MARK 02='diamnd': is not a class; choose from"):
         read_design(path, hd_map, Source(kinds={"MARK 02": "diamnd"}))
 
 
@@ -125,7 +125,7 @@ def test_a_drawing_that_does_not_state_its_unit_or_system_is_asked_for_them(tmp_
         read_design(tmp_path / "site.dxf", hd_map)
     with pytest.raises(ConfigError, match="does not say what its coordinates count from; give --crs"):
         read_design(tmp_path / "site.dxf", hd_map, Source(unit="mm"))
-    with pytest.raises(ConfigError, match="--unit 'furlong': is no unit"):
+    with pytest.raises(ConfigError, match="--unit 'furlong': is not a unit"):
         read_design(tmp_path / "site.dxf", hd_map, Source(unit="furlong"))
     design = read_design(tmp_path / "site.dxf", hd_map, Source(unit="mm", crs="local"))
     (shape,) = design.shapes
@@ -259,16 +259,16 @@ def test_a_spiral_ends_where_fresnel_says(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "says"),
     [
-        ("a.geojson", "{}", "is no collection of features"),
+        ("a.geojson", "{}", "is not a collection of features"),
         ("a.geojson", "[1]", "expected a JSON object"),
-        ("a.xodr", "<OpenDRIVE>", "is no XML that can be read"),
-        ("a.xodr", "<kml/>", "is no OpenDRIVE file"),
+        ("a.xodr", "<OpenDRIVE>", "is not readable XML"),
+        ("a.xodr", "<kml/>", "is not an OpenDRIVE file"),
         ("a.xodr", "<!DOCTYPE a><OpenDRIVE/>", "declares a document type"),
         ("a.xodr", BEND.replace('curvature="0.1"', 'curvature="x"'), "road 1: could not convert"),
         ("a.xodr", BEND.replace('hdg="0"', 'hdg="nan"'), "road 1: hdg of a geometry is not finite"),
         ("a.gpkg", "nothing", "not a GeoPackage"),
-        ("a.dxf", "nothing", "is no drawing that can be read"),
-        ("a.pdf", "", "is no design that can be read; give a file that ends in .geojson"),
+        ("a.dxf", "nothing", "is not a readable drawing"),
+        ("a.pdf", "", "is not a readable design; give a file that ends in .geojson"),
     ],
 )
 def test_files_that_are_no_designs_are_refused_in_one_line(name, text, says, tmp_path, hd_map):
@@ -281,7 +281,7 @@ def test_coordinates_that_are_no_degrees_are_refused(tmp_path, hd_map):
     path = foreign(tmp_path / "a.geojson", hd_map, crs="EPSG:4326")
     text = path.read_text().replace('"coordinates": [[[', '"coordinates": [[[500000.0, 5900000.0], [')
     path.write_text(text)
-    with pytest.raises(MapFileError, match="is no longitude and latitude; are its axes swapped"):
+    with pytest.raises(MapFileError, match="is not a longitude and latitude; are its axes swapped"):
         read_design(path, hd_map)
 
 

@@ -30,7 +30,9 @@ def hd_map():
 
 
 def values(findings, name):
-    return [one.value for finding in findings for one in finding.quantities if one.name == name]
+    return [
+        quantity.value for finding in findings for quantity in finding.quantities if quantity.name == name
+    ]
 
 
 def test_lengths_widths_gaps_and_spacings_are_measured(tmp_path, hd_map):
@@ -82,7 +84,7 @@ def test_wide_paint_is_off_by_a_rule_in_inches(tmp_path, hd_map):
     [
         ("lane_dash,width,0.1,0.2,,a", "line 2: has no unit; give one of: m, cm"),
         ("lane_dash,width,0.1,0.2,deg,a", "width is not measured in 'deg'"),
-        ("dash,width,0.1,0.2,m,a", "'dash' is no class"),
+        ("dash,width,0.1,0.2,m,a", "'dash' is not a class"),
         ("lane_dash,weight,0.1,0.2,m,a", "unknown quantity 'weight'"),
         ("lane_dash,width,0.3,0.2,m,a", "low is above high"),
         ("lane_dash,width,,,m,a", "has no limit"),

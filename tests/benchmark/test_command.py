@@ -64,7 +64,7 @@ def test_the_true_map_has_a_perfect_score_and_a_moved_one_its_error(tmp_path, ca
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["make", "port3", "drive"], "'port3': is no site of the benchmark"),
+        (["make", "port3", "drive"], "'port3': is not a site of the benchmark"),
         (["score", "nothing.geojson", "streets"], "nothing.geojson: no such file"),
         (["score", "empty.geojson", "streets"], "has no marking of four corners to score"),
         (["score", "empty.geojson", "streets", "--class", "a"], "--class a: give it as NAME=CLASS"),
@@ -92,10 +92,10 @@ def test_the_table_of_the_page_is_written_from_scores(tmp_path, cache, streets, 
     path = write(tmp_path / "map.geojson", paint(streets, (0.03, 0.0), sigma_m=0.03), verdict="PASS")
     assert main(["benchmark", "score", str(path), "streets", "--cache", str(cache), "--json"]) == 0
     text = tool.table([json.loads(capsys.readouterr().out)])
-    head, _, recall, _, *rest = text.splitlines()
+    head, _, recall, _, *more_lines = text.splitlines()
     assert head == "| figure | `streets` |"
     assert recall.startswith("| recall | 100.0 % of ")
-    cells = [row.split(" | ")[1].removesuffix(" |") for row in rest]
+    cells = [row.split(" | ")[1].removesuffix(" |") for row in more_lines]
     assert cells == [
         "3.0 cm", "3.0 cm", "0.50", "2.00 / - / 0.00", "100.0 %", "-", "PASS: right", "right"
     ]  # fmt: skip

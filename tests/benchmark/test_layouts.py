@@ -50,9 +50,9 @@ def test_a_vehicle_at_rest_does_not_turn_about():
 
 def test_files_that_make_no_site_are_one_line(tmp_path):
     design = site_of("quay").layout.design
-    near = way(tmp_path / "near.tum", [(0.5 * k, -1.75) for k in range(20)])
+    short_way = way(tmp_path / "near.tum", [(0.5 * k, -1.75) for k in range(20)])
     with pytest.raises(DriveError, match=r"near.tum: moves by 9.5 m in all; give 25 m or more"):
-        network_of(Layout(design, near), 5.0)
+        network_of(Layout(design, short_way), 5.0)
     far = way(tmp_path / "far.tum", [(0.5 * k, 900.0) for k in range(100)])
     with pytest.raises(MapFileError, match=r"within 40 m of .*far.tum; give a way in the file's coord"):
         network_of(Layout(design, far), 5.0)

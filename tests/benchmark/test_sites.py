@@ -25,7 +25,7 @@ from v2hdm.simulate.port.config import PortConfig, SurveyConfig
 from v2hdm.simulate.port.drive import folder_of_port, true_drive
 
 
-def quiet(done, total):
+def quiet(finished, total):
     """Progress that nobody sees."""
 
 
@@ -102,6 +102,6 @@ def test_every_site_has_published_hashes():
 
 def test_an_unknown_site_is_named():
     with pytest.raises(
-        ConfigError, match="'port3': is no site of the benchmark; choose from port1, port2, streets"
+        ConfigError, match="'port3': is not a site of the benchmark; choose from port1, port2, streets"
     ):
         site_of("port3")

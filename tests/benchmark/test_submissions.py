@@ -43,7 +43,7 @@ def test_a_map_of_ours_with_another_origin_is_brought_to_the_sites(tmp_path, ref
 def test_names_of_another_tool_are_explained(tmp_path, reference):
     features = [feature("rhombus", m.corners_map) for m in reference.truth.map.markings[:30]]
     path = write(tmp_path / "map.geojson", features)
-    with pytest.raises(MapFileError, match=r"no classes: 'rhombus' .30.; --class NAME=CLASS"):
+    with pytest.raises(MapFileError, match=r"unknown classes: 'rhombus' .30.; --class NAME=CLASS"):
         read_submission(path, reference.truth.map)
     submission = read_submission(path, reference.truth.map, Source(kinds={"rhombus": "diamond"}))
     assert {marking.kind for marking in submission.hd_map.markings} == {"diamond"}
@@ -67,7 +67,7 @@ def test_a_polygon_of_more_corners_is_scored_by_the_box_about_it(tmp_path, refer
 
 
 BAD = {
-    "swapped degrees": (lambda r: paint(r, swap=True), {}, "no longitude and latitude; are its axes swapped"),
+    "swapped degrees": (lambda r: paint(r, swap=True), {}, "not a longitude and latitude; are its axes"),
     "grid without its name": (
         lambda r: paint(r, (351_000.0, 3_314_000.0), local=True), {}, "or is it in another system"
     ),
@@ -94,10 +94,10 @@ BAD = {
     "a line as a ring": (
         lambda r: [feature("diamond", DIAMOND * (1.0, 0.0))], {}, "feature 0: encloses nothing"
     ),
-    "a sigma of nothing": (lambda r: paint(r, sigma_m=0), {}, "feature 0, sigma_m: 0 m is no standard dev"),
+    "a sigma of nothing": (lambda r: paint(r, sigma_m=0), {}, "feature 0, sigma_m: 0 m is not a standard d"),
     "a sigma in words": (lambda r: paint(r, sigma_m="2 cm"), {}, "sigma_m: expected a finite number"),
     "half a covariance": (lambda r: paint(r, covariance_m2=[[1.0]]), {}, "feature 0, covariance_m2"),
-    "a verdict of its own": (paint, {"verdict": "fine"}, "its verdict is none of PASS, WARN, FAIL"),
+    "a verdict of its own": (paint, {"verdict": "fine"}, "its verdict is not one of PASS, WARN, FAIL"),
 }  # fmt: skip
 
 
@@ -120,10 +120,10 @@ def test_metres_with_swapped_axes_are_named(tmp_path, reference):
 
 def test_a_file_of_another_format_is_refused(tmp_path, reference):
     (tmp_path / "map.dxf").write_text("0")
-    with pytest.raises(MapFileError, match=r"is no GeoJSON; give a file that ends in \.geojson"):
+    with pytest.raises(MapFileError, match=r"is not a GeoJSON file; give one that ends in \.geojson"):
         read_submission(tmp_path / "map.dxf", reference.truth.map)
     (tmp_path / "map.geojson").write_text("{}")
-    with pytest.raises(MapFileError, match="is no collection of features"):
+    with pytest.raises(MapFileError, match="is not a collection of features"):
         read_submission(tmp_path / "map.geojson", reference.truth.map)
 
 

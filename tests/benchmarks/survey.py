@@ -8,9 +8,10 @@ how far errors of one corner are alike in different images. Those of port 2 are 
 ``python -m tests.benchmarks.survey --joint KM [--section-m M]``: a problem of a survey, adjusted at once and
 in rounds over its sections: corners in mm, sigmas in per cent, seconds of CPU.
 
-``python -m tests.benchmarks.survey --grow KM [KM ...] [--section-m M] [--workers N]``: a map of each length
-in sections, in a process of its own: peak memory, CPU, errors and coverage against the truth; then the
-exponents of growth.
+``python -m tests.benchmarks.survey --grow KM [KM ...] [--section-m M] [--workers N] [--memory-gb GB]``: a map
+of each length in sections, in a process of its own: peak memory, CPU, errors and coverage against the truth;
+then the exponents of growth. Each of several Dask workers is ended where it takes more memory than so much.
+The CPU of all processes counts, ``survey_s`` of which made the survey, or read it where it is in the cache.
 
 ``python -m tests.benchmarks.survey --apart KM [--section-m M]``: the same survey mapped at once and in
 sections, each in a process of its own: CPU, how far corners are apart, and the ratio of their sigmas.
@@ -18,6 +19,7 @@ sections, each in a process of its own: CPU, how far corners are apart, and the 
 
 import argparse
 import json
+import multiprocessing
 import pickle
 import resource
 import subprocess
@@ -59,6 +61,7 @@ _BORDER_PX = 4.0
 _STEP_M = 2.0  # width of a class of distances
 _FARTHEST_M = 26.0
 _MOTION_M = 0.01  # motion on the ground by which a pixel's is told
+_WORKER_END_S = 60.0  # time for a worker to end by itself, on a busy machine
 _TAIL_SIGMAS = 3.0  # errors beyond are outliers to the mapping
 
 
@@ -269,20 +272,33 @@ class FromFiles:
         return [read_detections(image.path, at) for at, image in enumerate(images)]
 
 
-def one_length(length_km: float, section_m: float, workers: int, cache: Path, keep: Path | None) -> None:
+def _show_step(step: str, done: int, total: int) -> None:
+    """Print a step of the mapping and how far it is, for whoever waits."""
+    print(f"{time.strftime('%H:%M:%S')} {step}: {done} of {total}", file=sys.stderr, flush=True)
+
+
+def one_length(
+    length_km: float, section_m: float, workers: int, memory_gb: float, cache: Path, keep: Path | None
+) -> None:
     """Map one survey, in no sections if these are of 0 m, and print its figures as JSON."""
+    begin_s = time.process_time()
     drive, true_map = survey_of(length_km, cache)
+    survey_s = time.process_time() - begin_s
     cameras = list(drive.cameras)
     begin_s = time.perf_counter()
     if section_m == 0:
         result = run_methods(drive, detections_of(drive), cameras, MappingOptions(), naive=False)[BEST]
     else:
-        with open_executor(workers) as executor, tempfile.TemporaryDirectory(dir=cache) as folder:
+        with (
+            open_executor(workers, memory_gb=memory_gb) as executor,
+            tempfile.TemporaryDirectory(dir=cache) as folder,
+        ):
             result = map_in_sections(
-                drive, FromFiles(), cameras, MappingOptions(), section_m, executor, Path(folder)
+                drive, FromFiles(), cameras, MappingOptions(), section_m, executor, Path(folder), _show_step
             )
     if keep is not None:
         keep.write_bytes(pickle.dumps(result.hd_map))
+    _wait_for_workers()
     usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     figures = {
         "km": length_km,
@@ -292,11 +308,21 @@ def one_length(length_km: float, section_m: float, workers: int, cache: Path, ke
         "true": len(true_map.markings),
         "wall_s": time.perf_counter() - begin_s,
         "cpu_s": sum(part.ru_utime + part.ru_stime for part in usage),
+        "survey_s": survey_s,
         "peak_mb": usage[0].ru_maxrss / 1e3,
         "worker_peak_mb": usage[1].ru_maxrss / 1e3,
         **_against(result.hd_map, true_map),
     }
     print(json.dumps(figures))
+
+
+def _wait_for_workers() -> None:
+    """Wait for processes that are left: the CPU of one counts once it was waited for."""
+    for worker in multiprocessing.active_children():
+        worker.join(_WORKER_END_S)
+        if worker.is_alive():
+            worker.terminate()
+            worker.join()
 
 
 def _against(hd_map: HDMap, true_map: HDMap) -> dict[str, float]:
@@ -376,11 +402,12 @@ def _print_apart(whole: HDMap, parted: HDMap) -> None:
     print("sigmas, least, 5 %, median, 95 %, most:", " ".join(f"{value:.4f}" for value in share))
 
 
-def grow(lengths_km: list[float], section_m: float, workers: int, cache: Path) -> None:
+def grow(lengths_km: list[float], section_m: float, workers: int, memory_gb: float, cache: Path) -> None:
     """Print the figures of each length, and the exponents of growth from the first to the last."""
     rows = []
     for length_km in lengths_km:
         words = ["--one", str(length_km), "--section-m", str(section_m), "--workers", str(workers)]
+        words += ["--memory-gb", str(memory_gb)]
         rows.append(_in_a_process(words, cache))
         shown = {key: round(value, 3) for key, value in rows[-1].items()}
         print(" ".join(f"{key} {value:g}" for key, value in shown.items()), flush=True)
@@ -394,9 +421,9 @@ def grow(lengths_km: list[float], section_m: float, workers: int, cache: Path) -
 
 
 def _in_a_process(words: list[str], cache: Path) -> dict[str, float]:
-    """The figures that this module prints with some words of its command."""
+    """The figures that this module prints with some words of its command; its progress is shown."""
     command = [sys.executable, "-m", "tests.benchmarks.survey", *words, "--cache", str(cache)]
-    process = subprocess.run(command, check=True, capture_output=True, text=True)
+    process = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     figures: dict[str, float] = json.loads(process.stdout.splitlines()[-1])
     return figures
 
@@ -414,6 +441,7 @@ def main() -> None:
     parser.add_argument("--section-m", type=float, default=1000.0, metavar="M")
     parser.add_argument("--keep", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--workers", type=int, default=1, metavar="N")
+    parser.add_argument("--memory-gb", type=float, default=2.0, metavar="GB", help="most for each of several")
     parser.add_argument("--cache", type=Path, default=Path("cache"), metavar="DIR", help="keeps the surveys")
     parsed = parser.parse_args()
     if parsed.statistics is not None:
@@ -421,11 +449,11 @@ def main() -> None:
     elif parsed.joint is not None:
         joint(parsed.joint, parsed.section_m, parsed.cache)
     elif parsed.grow is not None:
-        grow(parsed.grow, parsed.section_m, parsed.workers, parsed.cache)
+        grow(parsed.grow, parsed.section_m, parsed.workers, parsed.memory_gb, parsed.cache)
     elif parsed.apart is not None:
         apart(parsed.apart, parsed.section_m, parsed.cache)
     else:
-        one_length(parsed.one, parsed.section_m, parsed.workers, parsed.cache, parsed.keep)
+        one_length(parsed.one, parsed.section_m, parsed.workers, parsed.memory_gb, parsed.cache, parsed.keep)
 
 
 if __name__ == "__main__":

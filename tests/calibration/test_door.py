@@ -48,8 +48,8 @@ def run(folder, table, *arguments):
 def test_ten_points_end_in_a_calibration_a_drive_entry_a_table_and_a_picture(tmp_path, intrinsics, capsys):
     image = np.full((720, 1280, 3), 90, np.uint8)
     cv2.imwrite(str(tmp_path / "yard.png"), image)
-    given = ("--intrinsics", intrinsics, "--image", tmp_path / "yard.png")
-    assert run(tmp_path, clicked(seed=1), *given) == 0
+    arguments = ("--intrinsics", intrinsics, "--image", tmp_path / "yard.png")
+    assert run(tmp_path, clicked(seed=1), *arguments) == 0
     shown = capsys.readouterr().out
     angles = re.match(
         r"front: roll (\S+) \+- (\S+) deg, pitch (\S+) \+- (\S+) deg, yaw (\S+) \+- (\S+) deg", shown
@@ -60,10 +60,10 @@ def test_ten_points_end_in_a_calibration_a_drive_entry_a_table_and_a_picture(tmp
     assert "verdict: PASS (nothing raised, 4 checks passed)" in shown
 
     out = tmp_path / "out"
-    found = read_calibration(out / "calibration_front.yaml")
-    assert found.covariance is not None
+    calibration = read_calibration(out / "calibration_front.yaml")
+    assert calibration.covariance is not None
     assert read_provenance(out / "calibration_front.yaml").drive == "points"
-    centre = -found.cam_from_vehicle[:3, :3].T @ found.cam_from_vehicle[:3, 3]
+    centre = -calibration.cam_from_vehicle[:3, :3].T @ calibration.cam_from_vehicle[:3, 3]
     np.testing.assert_allclose(centre, CENTRE, atol=0.05)
     assert json.loads((out / "verdict.json").read_text())["status"] == "PASS"
     with (out / "points.csv").open() as file:
@@ -300,10 +300,10 @@ def test_points_outside_the_image_and_repeated_ones_are_named(tmp_path, change, 
 
 
 def test_a_calibration_from_points_is_data_and_writes_nothing(tmp_path):
-    found = calibrate_from_points(write_table(tmp_path, *clicked(seed=3)), INFO)
-    assert found.verdict.status is Status.PASS
-    assert found.calibration.covariance is not None
-    assert len(found.roi_vehicle) >= 3
+    fitted = calibrate_from_points(write_table(tmp_path, *clicked(seed=3)), INFO)
+    assert fitted.verdict.status is Status.PASS
+    assert fitted.calibration.covariance is not None
+    assert len(fitted.roi_vehicle) >= 3
     assert [path.name for path in tmp_path.iterdir()] == ["points.csv"]
 
 
@@ -337,17 +337,17 @@ def turned(true, pitch_deg, yaw_deg, up_m=0.0):
 def test_a_camera_that_stays_is_said_to_have_moved_as_seldom_as_stated():
     rng = np.random.default_rng(0)
     true = looking_ahead()
-    found = [movement(measured(true, rng), measured(true, rng)).probability for _ in range(2000)]
-    assert np.mean(np.array(found) < 0.05) == pytest.approx(0.05, abs=0.015)
-    assert np.mean(np.array(found) < FALSE_ALARM) < 0.004
+    probabilities = [movement(measured(true, rng), measured(true, rng)).probability for _ in range(2000)]
+    assert np.mean(np.array(probabilities) < 0.05) == pytest.approx(0.05, abs=0.015)
+    assert np.mean(np.array(probabilities) < FALSE_ALARM) < 0.004
 
 
 def test_a_movement_is_told_along_and_about_the_vehicles_axes():
     true = looking_ahead()
-    found = movement(true, turned(true, 0.4, -0.3, 0.02))
-    assert found.moved
-    assert np.degrees(found.turn_rad) == pytest.approx([0, 0.4, -0.3], abs=0.005)
-    assert found.shift_m == pytest.approx([0, 0, 0.02], abs=1e-9)
+    moved = movement(true, turned(true, 0.4, -0.3, 0.02))
+    assert moved.moved
+    assert np.degrees(moved.turn_rad) == pytest.approx([0, 0.4, -0.3], abs=0.005)
+    assert moved.shift_m == pytest.approx([0, 0, 0.02], abs=1e-9)
 
 
 def test_the_stated_errors_of_a_movement_hold():
@@ -355,9 +355,9 @@ def test_the_stated_errors_of_a_movement_hold():
     true, after = looking_ahead(), turned(looking_ahead(), 2.0, 1.0)
     off = []
     for _ in range(400):
-        found = movement(measured(true, rng), measured(after, rng))
-        error = np.concatenate([found.shift_m, found.turn_rad - movement(true, after).turn_rad])
-        off.append(error @ np.linalg.solve(found.covariance, error))
+        moved = movement(measured(true, rng), measured(after, rng))
+        error = np.concatenate([moved.shift_m, moved.turn_rad - movement(true, after).turn_rad])
+        off.append(error @ np.linalg.solve(moved.covariance, error))
     assert np.mean(off) == pytest.approx(6.0, abs=0.6)
 
 
@@ -400,8 +400,8 @@ def test_cameras_that_turn_alike_blame_the_heading(tmp_path, capsys):
     for folder, yaw_deg in (("before", 0.0), ("after", 2.0)):
         (tmp_path / folder).mkdir()
         for name in ("front", "rear"):
-            one = turned(looking_ahead(replace(AHEAD, name=name)), 0, yaw_deg)
-            write_calibration(one, tmp_path / folder / f"calibration_{name}.yaml")
+            calibration = turned(looking_ahead(replace(AHEAD, name=name)), 0, yaw_deg)
+            write_calibration(calibration, tmp_path / folder / f"calibration_{name}.yaml")
     assert run_command(["calibrate", "compare", str(tmp_path / "before"), str(tmp_path / "after")]) == 3
     assert "all cameras have turned alike" in capsys.readouterr().out
 
@@ -419,8 +419,16 @@ def test_a_camera_without_enough_ground_fails_as_its_line_says(tmp_path, capsys)
     listed = drive.root / "front" / "images.txt"
     rows = [row for row in listed.read_text().splitlines(keepends=True) if not row.startswith("#")]
     listed.write_text(rows[0])
-    given = ["calibrate", "ground", str(drive.root), "--camera", "front", "--output", str(tmp_path / "out")]
-    assert run_command(given) == 3
+    arguments = [
+        "calibrate",
+        "ground",
+        str(drive.root),
+        "--camera",
+        "front",
+        "--output",
+        str(tmp_path / "out"),
+    ]
+    assert run_command(arguments) == 3
     shown = capsys.readouterr().out
     assert "front: too little ground appears in two images: drive farther" in shown
     assert "verdict: FAIL" in shown

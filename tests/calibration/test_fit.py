@@ -50,12 +50,12 @@ def test_a_mounting_is_as_good_as_theory_says_and_its_sigmas_hold(pixel_px, surv
     scale = np.sqrt(np.outer(np.diag(limit), np.diag(limit)))
     errors, nees = [], []
     for seed in range(draws):
-        found = fit(*clicked(seed, pixel_px, survey_m), Noise(pixel_px, survey_m))
-        error = log(found.cam_from_vehicle @ inverse(mounting()))
+        mount = fit(*clicked(seed, pixel_px, survey_m), Noise(pixel_px, survey_m))
+        error = log(mount.cam_from_vehicle @ inverse(mounting()))
         errors.append(error)
-        nees.append(error @ np.linalg.solve(found.covariance, error) / 6)
+        nees.append(error @ np.linalg.solve(mount.covariance, error) / 6)
         # The noise factor alone makes the sigmas differ from the bound.
-        assert np.abs((found.covariance / found.factor - limit) / scale).max() < 0.15
+        assert np.abs((mount.covariance / mount.factor - limit) / scale).max() < 0.15
     efficiency = np.mean([error @ np.linalg.solve(limit, error) / 6 for error in errors])
     # Forty draws of six leave a mean of one uncertain by .09.
     assert efficiency == pytest.approx(1.0, abs=0.27)
@@ -67,15 +67,15 @@ def test_the_ipm_is_off_as_its_sigma_says():
     truth = project(mounting(), places)
     off, sigma = [], []
     for seed in range(25):
-        found = fit(*clicked(seed), Noise())
-        sigma.append(known_ground(found, places))
+        mount = fit(*clicked(seed), Noise())
+        sigma.append(known_ground(mount, places))
         # What the found camera sees where the true one sees the places: Newton, once.
         by_place = np.stack(
-            [project(found.cam_from_vehicle, places + s) - project(found.cam_from_vehicle, places)
+            [project(mount.cam_from_vehicle, places + s) - project(mount.cam_from_vehicle, places)
              for s in 1e-4 * np.eye(2)], axis=2,
         ) / 1e-4  # fmt: skip
         off.append(
-            np.linalg.solve(by_place, (truth - project(found.cam_from_vehicle, places))[..., None])[..., 0]
+            np.linalg.solve(by_place, (truth - project(mount.cam_from_vehicle, places))[..., None])[..., 0]
         )
     worst = np.sqrt(
         [np.linalg.eigvalsh(np.array(off)[:, k].T @ np.array(off)[:, k] / 25)[-1] for k in range(3)]
@@ -88,14 +88,14 @@ def test_one_wrong_point_is_named_and_moves_nothing(moved):
     wrong, *shift = moved
     px, places = clicked(5)
     places[wrong] += shift
-    found = fit(px, places, Noise(), starts=4)
+    mount = fit(px, places, Noise(), starts=4)
     others = np.arange(10) != wrong
-    np.testing.assert_array_equal(found.is_right, others)
+    np.testing.assert_array_equal(mount.is_right, others)
     without = fit_mountings(
         SeenPoints.of(px[others], places[others], INFO, Noise()), starts=4
     )[0]  # fmt: skip
-    np.testing.assert_allclose(found.cam_from_vehicle, without.cam_from_vehicle, atol=1e-4)
-    off = residuals(found)
+    np.testing.assert_allclose(mount.cam_from_vehicle, without.cam_from_vehicle, atol=1e-4)
+    off = residuals(mount)
     assert off.sigmas[wrong] > 10
     assert off.sigmas[others].max() < 5
 
@@ -150,5 +150,5 @@ def test_cameras_that_look_any_way_through_any_lens_are_found(where, model):
     ipm = facing_ipm(ipm_from_extrinsic(info, truth), ahead[:2])
     places = apply_in_front(ipm, undistort_points(info, px))
     assert np.isfinite(places).all()
-    found = fit_mountings(SeenPoints.of(px, places, info, Noise()), starts=1)[0]
-    np.testing.assert_allclose(found.cam_from_vehicle, truth, atol=1e-5)
+    mount = fit_mountings(SeenPoints.of(px, places, info, Noise()), starts=1)[0]
+    np.testing.assert_allclose(mount.cam_from_vehicle, truth, atol=1e-5)

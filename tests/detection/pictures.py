@@ -244,9 +244,9 @@ def anchors_of(view: RoadCamera, lines_px: list[np.ndarray], hidden: slice = sli
         for line in lines_px:
             order = np.argsort(line[:, 1])
             u.append(np.interp(v, line[order, 1], line[order, 0], left=np.nan, right=np.nan))
-        seen = np.array([x for x in u if 0 <= x < view.info.width])
-        if len(seen):
-            rows.append(AnchorRow(float(v), seen, np.full(len(seen), 4.0)))
+        columns = np.array([x for x in u if 0 <= x < view.info.width])
+        if len(columns):
+            rows.append(AnchorRow(float(v), columns, np.full(len(columns), 4.0)))
     del rows[hidden]
     return rows
 
@@ -260,8 +260,8 @@ def straight(view: RoadCamera, left_m: float, curvature: float = 0.0) -> np.ndar
 def painted(line_px: np.ndarray, view: RoadCamera, near_m: float, far_m: float) -> LaneDetection:
     """The centre line of a line's paint (N, 2) between two distances, a point every half a metre."""
     x = view.ground(view.undistort(line_px))[:, 0]
-    seen = (x >= near_m) & (x <= far_m) & view.inside(line_px, 0)
-    return LaneDetection(LANE_DASH, 0.9, line_px[seen][::2])
+    is_visible = (x >= near_m) & (x <= far_m) & view.inside(line_px, 0)
+    return LaneDetection(LANE_DASH, 0.9, line_px[is_visible][::2])
 
 
 def off_px(lane: LaneDetection, line_px: np.ndarray) -> np.ndarray:

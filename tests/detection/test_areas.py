@@ -47,9 +47,9 @@ def test_the_letters_of_a_word_are_one_area_with_the_hull_of_all(yaw_deg):
 def test_two_words_are_two_areas_and_two_letters_of_one_are_one():
     first, second = word("EB", (7.0, 2.2)), word("HO", (7.0, -0.8))
     areas, _ = areas_of(("text", first), ("text", second))
-    found = sorted(max(overlap(area.outline_px, one) for one in (first, second)) for area in areas)
-    assert len(found) == 2
-    assert found[0] > 0.85
+    overlaps = sorted(max(overlap(area.outline_px, letters) for letters in (first, second)) for area in areas)
+    assert len(overlaps) == 2
+    assert overlaps[0] > 0.85
 
 
 def test_a_letter_of_few_elements_belongs_to_the_word_beside_it_and_is_none_by_itself():
@@ -150,7 +150,7 @@ def test_a_letter_is_no_marking_and_a_surer_marking_in_a_box_stays():
         for score in (0.4, 0.999)
     )
     beside = MarkingDetection("diamond", 0.3, corners + np.array([300, 0]), np.eye(8), np.ones(4, dtype=bool))
-    assert [one.score for one in _not_of([area], (*markings, beside))] == [0.999, 0.3]
+    assert [marking.score for marking in _not_of([area], (*markings, beside))] == [0.999, 0.3]
 
 
 def test_a_box_whose_lines_the_network_takes_for_strokes_of_letters_is_named_by_its_meshes():

@@ -73,9 +73,9 @@ def moved(calibration, tangent):
 @pytest.mark.parametrize("lens", ["pinhole", "plumb_bob", "equidistant"])
 def test_corners_land_where_they_are_on_the_ground(lens):
     points_px = to_image(make_camera(lens), CORNERS)
-    found = footprint(calibrated(lens), points_px)
-    np.testing.assert_allclose(found.points_vehicle, CORNERS, atol=2e-3)
-    np.testing.assert_array_equal(found.joint_covariance(np.zeros((8, 8))), np.zeros((8, 8)))
+    on_ground = footprint(calibrated(lens), points_px)
+    np.testing.assert_allclose(on_ground.points_vehicle, CORNERS, atol=2e-3)
+    np.testing.assert_array_equal(on_ground.joint_covariance(np.zeros((8, 8))), np.zeros((8, 8)))
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "equidistant"])
@@ -114,8 +114,8 @@ def test_the_share_of_the_calibration_is_that_of_differences():
 def test_points_of_a_line_have_the_covariance_of_single_corners():
     calibration = calibrated(covariance=np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6]))
     points_px = to_image(make_camera(), CORNERS)
-    found = footprint(calibration, points_px)
-    single, together = found.single_covariances(0.5), found.joint_covariance(0.25 * np.eye(8))
+    on_ground = footprint(calibration, points_px)
+    single, together = on_ground.single_covariances(0.5), on_ground.joint_covariance(0.25 * np.eye(8))
     for n in range(4):
         np.testing.assert_allclose(single[n], together[2 * n : 2 * n + 2, 2 * n : 2 * n + 2], rtol=1e-9)
 
@@ -123,9 +123,9 @@ def test_points_of_a_line_have_the_covariance_of_single_corners():
 def test_a_point_above_the_horizon_spoils_no_other():
     points_px = to_image(make_camera(), CORNERS)
     points_px[2] = [320.0, 5.0]
-    found = footprint(calibrated(), points_px)
-    covariance = found.joint_covariance(np.eye(8))
-    assert np.isnan(found.points_vehicle[2]).all()
+    on_ground = footprint(calibrated(), points_px)
+    covariance = on_ground.joint_covariance(np.eye(8))
+    assert np.isnan(on_ground.points_vehicle[2]).all()
     others = [0, 1, 2, 3, 6, 7]
     assert np.isfinite(covariance[np.ix_(others, others)]).all()
     assert np.isnan(covariance[4:6]).all()

@@ -57,15 +57,15 @@ def run(models, shapes, lens="plumb_bob", seeds=(0,), kind="diamond", blur_px=0.
     camera = make_camera(lens)
     camera = camera if not linear else type(camera)(**{**vars(camera), "linear_response": True})
     truth_px = [to_image(camera, shape) for shape in shapes]
-    parts, found = [], 0
+    parts, count = [], 0
     for seed in seeds:
         image = picture(
             camera, shapes, blur_px=blur_px, seed=seed, linear=linear, paint=0.9 if linear else 0.5
         )
         markings, _ = detect(models, image, camera, kind, **options)
-        found += len(markings)
+        count += len(markings)
         parts.append(errors_px(markings, truth_px))
-    return *(np.concatenate(part) for part in zip(*parts, strict=True)), found / len(seeds)
+    return *(np.concatenate(part) for part in zip(*parts, strict=True)), count / len(seeds)
 
 
 def normalised(errors, covariances):
@@ -75,16 +75,16 @@ def normalised(errors, covariances):
 
 @pytest.mark.parametrize("lens", sorted(LENSES))
 def test_near_corners_are_found_to_a_tenth_of_a_pixel(models, lens):
-    errors, _, found = run(models, NEAR, lens)
-    assert found == len(NEAR)
+    errors, _, count = run(models, NEAR, lens)
+    assert count == len(NEAR)
     assert len(errors) == 4 * len(NEAR)
     assert np.quantile(np.linalg.norm(errors, axis=1), 0.9) < 0.12
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "plumb_bob", "rational_polynomial"])
 def test_far_corners_are_found_to_a_fifth_of_a_pixel(models, lens):
-    errors, _, found = run(models, FAR, lens)
-    assert found == len(FAR)
+    errors, _, count = run(models, FAR, lens)
+    assert count == len(FAR)
     distance = np.linalg.norm(errors, axis=1)
     assert np.median(distance) < 0.12
     assert np.quantile(distance, 0.9) < 0.35
@@ -97,8 +97,8 @@ def test_far_corners_are_not_pushed_outwards(models):
 
 
 def test_a_camera_with_linear_response_is_taken_at_its_word(models):
-    errors, _, found = run(models, NEAR + FAR[:6], linear=True)
-    assert found >= len(NEAR) + 5
+    errors, _, count = run(models, NEAR + FAR[:6], linear=True)
+    assert count >= len(NEAR) + 5
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.12
 
 
@@ -191,30 +191,30 @@ def dash_behind(box_at):
     scene = Scene(paints=(Paint(kind="lane_dash", polygon_map=dash),), boxes=tuple(boxes))
     image = Renderer(scene).render(camera.info, extrinsic(), np.random.default_rng(0)).image
     markings, _ = Detector.load(options=DetectorOptions.for_mapping()).detect(image, camera)
-    found = max(markings, key=lambda marking: marking.score)
-    order = np.argsort(found.corners_px[:, 1])
-    along = found.corners_px[order[2:]].mean(axis=0) - found.corners_px[order[:2]].mean(axis=0)
-    sigma_px = [sigma_along(found.covariance_px, corner, along) for corner in order]
-    return found, order, sigma_px
+    surest = max(markings, key=lambda marking: marking.score)
+    order = np.argsort(surest.corners_px[:, 1])
+    along = surest.corners_px[order[2:]].mean(axis=0) - surest.corners_px[order[:2]].mean(axis=0)
+    sigma_px = [sigma_along(surest.covariance_px, corner, along) for corner in order]
+    return surest, order, sigma_px
 
 
 def test_an_end_behind_a_box_is_vague_along_the_dash_and_one_that_is_seen_is_not():
-    found, _, sigma_px = dash_behind(None)
-    assert found.corner_valid.all()
+    dash, _, sigma_px = dash_behind(None)
+    assert dash.corner_valid.all()
     assert max(sigma_px) < 5
     for box_at, hidden in (((8.4, 0.0), slice(0, 2)), ((6.2, 0.0), slice(2, 4))):
-        found, order, sigma_px = dash_behind(box_at)
-        assert not found.corner_valid[order[hidden]].any()
+        dash, order, sigma_px = dash_behind(box_at)
+        assert not dash.corner_valid[order[hidden]].any()
         assert min(sigma_px[hidden]) > 5
-        seen = [k for k in range(4) if k not in range(4)[hidden]]
-        assert found.corner_valid[order[seen]].all()
-        assert max(sigma_px[k] for k in seen) < 5
+        visible_corners = [k for k in range(4) if k not in range(4)[hidden]]
+        assert dash.corner_valid[order[visible_corners]].all()
+        assert max(sigma_px[k] for k in visible_corners) < 5
 
 
 def test_narrow_far_dashes_are_fitted_as_a_whole(models):
     shapes = [bar(x, y, 3.0, 0.15) for x in (8.0, 12.0) for y in (-1.7, 1.7)]
-    errors, _, found = run(models, shapes, kind="lane_dash")
-    assert found == len(shapes)
+    errors, _, count = run(models, shapes, kind="lane_dash")
+    assert count == len(shapes)
     across = np.median(np.abs(errors[:, 0]))
     assert across < 0.15
 
@@ -340,12 +340,12 @@ def test_an_end_beyond_the_border_is_vague_along_the_dash_and_the_other_end_is_n
     assert true_px[:, 1].max() > camera.info.height + 20
     image = picture(camera, [shape])
     view = RoadCamera(camera, 16)
-    seen = true_px.copy()
+    cut_px = true_px.copy()
     for low, high in ((0, 3), (1, 2)):
-        assert seen[low, 1] > seen[high, 1]
-        share = (camera.info.height - 1 - seen[high, 1]) / (seen[low, 1] - seen[high, 1])
-        seen[low] = seen[high] + share * (seen[low] - seen[high])
-    start = order_corners(seen)[None]
+        assert cut_px[low, 1] > cut_px[high, 1]
+        share = (camera.info.height - 1 - cut_px[high, 1]) / (cut_px[low, 1] - cut_px[high, 1])
+        cut_px[low] = cut_px[high] + share * (cut_px[low] - cut_px[high])
+    start = order_corners(cut_px)[None]
     fit = fit_quadrilaterals(patches_about(image, view, start), view, start, open_sides(start, view))
     corners_px, covariance = fit.corners_px, fit.covariance_px()
     order = np.argsort(corners_px[0][:, 1])

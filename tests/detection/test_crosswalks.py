@@ -119,7 +119,7 @@ def test_the_bars_of_an_image_are_its_crosswalk_s_parts():
     valid = np.ones(4, dtype=bool)
     stop = MarkingDetection("stop_line", 0.9, to_image(CAMERA, bar(5.5, 0, 0.3, 3.0)), np.eye(8), valid)
     markings = [
-        MarkingDetection("crosswalk_bar", 0.8, to_image(CAMERA, one), np.eye(8), valid) for one in bars
+        MarkingDetection("crosswalk_bar", 0.8, to_image(CAMERA, bar), np.eye(8), valid) for bar in bars
     ]
     ((crosswalk, parts),) = find_crosswalks([stop, *markings], RoadCamera(CAMERA, 16))
     assert (crosswalk.kind, crosswalk.score, sorted(parts)) == (

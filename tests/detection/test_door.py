@@ -151,8 +151,8 @@ def test_images_of_one_name_are_drawn_one_by_one(bench, tmp_path):
 def test_the_images_of_a_drive_are_numbered_by_camera(tmp_path, capsys):
     make_drive(tmp_path / "drive")
     assert run(["detect", str(tmp_path / "drive")]) == 0
-    found = [(one["camera"], one["frame"]) for one in lines(capsys.readouterr().out)]
-    assert sorted(found) == [(name, number) for name in ("front", "rear") for number in range(3)]
+    images = [(line["camera"], line["frame"]) for line in lines(capsys.readouterr().out)]
+    assert sorted(images) == [(name, number) for name in ("front", "rear") for number in range(3)]
 
 
 def test_a_video_gives_a_line_a_frame_with_its_time(bench, video, tmp_path, capsys):
@@ -217,23 +217,23 @@ def test_what_an_unplugged_camera_saw_is_kept(bench, tmp_path, monkeypatch, caps
 
 
 def test_a_slow_detector_gets_the_newest_frame_and_the_number_of_those_dropped():
-    given, read = queue.Queue(), queue.Queue()
+    arriving, read = queue.Queue(), queue.Queue()
 
     def camera():
-        for index in iter(given.get, None):
+        for index in iter(arriving.get, None):
             yield Frame("camera 0", f"{index}", index, time.time(), np.zeros((2, 2, 3), np.uint8))
             read.put(index)
 
-    newest, found, total = frames.NewestFrames(camera()), [], 0
+    newest, taken_frames, total = frames.NewestFrames(camera()), [], 0
     for burst in (1, 5, 2, 10):
         for _ in range(burst):  # while the detector is busy
-            given.put(total)
+            arriving.put(total)
             total += 1
             read.get(timeout=10)
-        found.append(next(newest))
-    assert [frame.index for frame in found] == [0, 5, 7, 17]
-    assert [frame.dropped for frame in found] == [0, 4, 1, 9]
-    given.put(None)
+        taken_frames.append(next(newest))
+    assert [frame.index for frame in taken_frames] == [0, 5, 7, 17]
+    assert [frame.dropped for frame in taken_frames] == [0, 4, 1, 9]
+    arriving.put(None)
     with pytest.raises(StopIteration):
         next(newest)
 
@@ -249,12 +249,14 @@ def test_images_of_a_camera_grow_no_older_when_the_detector_is_slow(bench, tmp_p
     monkeypatch.setattr(frames.cv2, "VideoCapture", Fast)
     output = tmp_path / "found.jsonl"
     assert bench.run(0, "--live", "--output", output, "--limit", 12) == 0
-    found = lines(output.read_text())
-    assert len(found) == 12
-    assert [one["frame"] for one in found] == (np.cumsum([one["dropped"] + 1 for one in found]) - 1).tolist()
+    records = lines(output.read_text())
+    assert len(records) == 12
+    assert [record["frame"] for record in records] == (
+        np.cumsum([record["dropped"] + 1 for record in records]) - 1
+    ).tolist()
     said = capsys.readouterr().err
-    assert f"{sum(one['dropped'] for one in found)} images dropped" in said
-    assert sum(one["dropped"] for one in found) > 12
+    assert f"{sum(record['dropped'] for record in records)} images dropped" in said
+    assert sum(record["dropped"] for record in records) > 12
     age_ms, total_ms = (float(re.search(rf"^{row} +([0-9.]+)", said, re.M)[1]) for row in ("age", "all"))
     assert age_ms < total_ms + 50
 
@@ -274,9 +276,9 @@ def test_of_a_folder_that_grows_the_newest_whole_image_is_taken(bench, tmp_path,
     assert (first.name, first.dropped) == ("9", 0)
     for k, name in enumerate(("b", "a", "c")):
         write(f"{name}.png", old_s=9 - k)
-    taken = next(arriving)
-    assert (taken.name, taken.index) == ("c", 1)
-    assert taken.stamp_s == pytest.approx(time.time() - 7, abs=5)
+    frame = next(arriving)
+    assert (frame.name, frame.index) == ("c", 1)
+    assert frame.stamp_s == pytest.approx(time.time() - 7, abs=5)
     write("d.png", image[:200])
     threading.Timer(0.1, write, ["d.png"]).start()
     assert next(arriving).name == "d"
@@ -291,7 +293,7 @@ def test_a_folder_that_rests_is_not_listed_again_and_what_comes_then_is_seen(ben
     os.utime(tmp_path, (1.0, 1.0))
     listings, list_images = [], frames.list_images
     monkeypatch.setattr(
-        frames, "list_images", lambda *given: listings.append(time.time()) or list_images(*given)
+        frames, "list_images", lambda *arguments: listings.append(time.time()) or list_images(*arguments)
     )
     arriving = frames.arriving_frames(tmp_path)
     assert next(arriving).name == "0"
@@ -414,9 +416,9 @@ def test_the_class_for_a_robots_loop_gives_what_the_door_writes(bench, capsys):
     bench.run(bench.folder / "0.png")
     (record,) = lines(capsys.readouterr().out)
     road = RoadDetector.load(bench.calibration, bench.model)
-    found = road.detect(cv2.imread(str(bench.folder / "0.png")))
-    assert [marking.kind for marking in found.markings] == [m["class"] for m in record["markings"]]
-    for marking, written in zip(found.markings, record["markings"], strict=True):
+    detections = road.detect(cv2.imread(str(bench.folder / "0.png")))
+    assert [marking.kind for marking in detections.markings] == [m["class"] for m in record["markings"]]
+    for marking, written in zip(detections.markings, record["markings"], strict=True):
         np.testing.assert_allclose(marking.corners_vehicle, written["corners_vehicle"], atol=1e-4)
         digits = [[float(f"{value:.4g}") for value in row] for row in marking.covariance_m2]
         assert written["covariance_m2"] == digits
@@ -503,11 +505,11 @@ def test_lines_of_a_live_source_are_in_the_file_as_they_come_and_a_kill_loses_no
         process.kill()
         process.wait()
         assert [path.name for path in output.parent.iterdir()] == ["found.jsonl"]
-        known = output.read_text()
-        assert len(lines(known)) >= 2 * run_number
+        text = output.read_text()
+        assert len(lines(text)) >= 2 * run_number
         if run_number == 1:
-            output.write_text(known + '{"source": "half')
-    assert output.read_text().startswith(known[: known.index("\n")])
+            output.write_text(text + '{"source": "half')
+    assert output.read_text().startswith(text[: text.index("\n")])
     assert "half" not in output.read_text()
 
 

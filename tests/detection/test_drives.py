@@ -45,17 +45,17 @@ def model(tmp_path_factory):
 
 
 def test_the_result_does_not_depend_on_the_number_of_workers(drive, model):
-    seen = []
+    progress = []
     options = DetectorOptions(model=str(model))
-    alone = detect_all(drive, options, progress=lambda done, total: seen.append((done, total)))
+    alone = detect_all(drive, options, progress=lambda finished, total: progress.append((finished, total)))
     with open_executor(2) as executor:
         together = detect_all(drive, options, executor)
-    assert seen == [(n, 10) for n in range(1, 11)]
-    assert [found.image for found in together] == list(range(10))
+    assert progress == [(n, 10) for n in range(1, 11)]
+    assert [in_image.image for in_image in together] == list(range(10))
     for a, b in zip(alone, together, strict=True):
         assert len(a.markings) == len(b.markings) == 2
-        for one, other in zip(a.markings, b.markings, strict=True):
-            np.testing.assert_array_equal(one.corners_px, other.corners_px)
+        for marking, other in zip(a.markings, b.markings, strict=True):
+            np.testing.assert_array_equal(marking.corners_px, other.corners_px)
 
 
 BONNET = (slice(330, 350), slice(250, 400))
@@ -64,7 +64,7 @@ BONNET = (slice(330, 350), slice(250, 400))
 def drive_past(folder, kind="diamond", images=14, step_m=2.5):
     """A drive along a row of diamonds 3.7 m apart, a bright strip of the bonnet in every image."""
     camera = make_camera("pinhole")
-    taken = []
+    views = []
     for number in range(images):
         x = number * step_m
         ahead = [diamond(3.7 * k - x, 0.6, 1.2, 0.7) for k in range(40) if 5 < 3.7 * k - x < 12]
@@ -74,8 +74,8 @@ def drive_past(folder, kind="diamond", images=14, step_m=2.5):
         cv2.imwrite(str(path), pixels)
         pose = np.eye(4)
         pose[0, 3] = x
-        taken.append(Image("front", 0.1 * number, path, pose))
-    return Drive("past", folder, {"front": camera}, tuple(taken))
+        views.append(Image("front", 0.1 * number, path, pose))
+    return Drive("past", folder, {"front": camera}, tuple(views))
 
 
 @pytest.fixture
@@ -88,8 +88,8 @@ def test_paint_at_one_place_in_all_images_is_the_vehicle_and_is_left_out(tmp_pat
     learnt = with_own_vehicle(drive, Detector.load(options=options)).cameras["front"].own_vehicle
     assert learnt[BONNET].all()
     assert not learnt[:300].any(), "the diamonds pass by"
-    for found in detect_all(drive, options):
-        assert all(marking.corners_px[:, 1].mean() < 325 for marking in found.markings)
+    for in_image in detect_all(drive, options):
+        assert all(marking.corners_px[:, 1].mean() < 325 for marking in in_image.markings)
 
 
 def test_a_vehicle_that_stands_still_tells_nothing(tmp_path, options):
@@ -101,8 +101,8 @@ def test_a_mask_that_was_given_is_obeyed_and_not_learnt_anew(tmp_path, options):
     drive = drive_past(tmp_path, images=3)
     mask = np.zeros((360, 640), dtype=bool)
     mask[:, :] = True
-    given = replace(drive, cameras={"front": replace(drive.cameras["front"], own_vehicle=mask)})
-    assert all(not found.markings for found in detect_all(given, options))
+    masked = replace(drive, cameras={"front": replace(drive.cameras["front"], own_vehicle=mask)})
+    assert all(not in_image.markings for in_image in detect_all(masked, options))
 
 
 SIZES = {"length_m": [0.8, 1.4], "width_m": [0.4, 1.2]}
@@ -135,8 +135,8 @@ def test_an_own_quadrilateral_is_found_with_its_corners(folder):
     assert [marking.kind for marking in markings] == ["pad"]
     assert not [lane for lane in lanes if lane.kind == "pad"]
     true_px = order_corners(to_image(camera, shape))
-    apart = np.linalg.norm(markings[0].corners_px[:, None] - true_px, axis=2)
-    assert apart.min(axis=1).max() < 0.5
+    distances_px = np.linalg.norm(markings[0].corners_px[:, None] - true_px, axis=2)
+    assert distances_px.min(axis=1).max() < 0.5
     assert not len(markings[0].outline_px)
 
 

@@ -49,8 +49,8 @@ def along(corners, count=40):
 
 def proposal_of(shape, scores):
     blob = Blob(scores, np.ones((3, 3)), np.zeros(2), 2, to_image(VIEW.camera, along(shape)))
-    (found,) = propose([blob], VIEW, CATALOGUE, 30.0)
-    return found
+    (proposal,) = propose([blob], VIEW, CATALOGUE, 30.0)
+    return proposal
 
 
 def test_size_decides_where_the_network_is_in_doubt():
@@ -97,17 +97,17 @@ def test_an_arrow_is_as_likely_whatever_other_symbols_the_network_tells_apart():
 
 @pytest.mark.parametrize("shape", [RHOMBUS, STRIP, bar(6.0, 1.0, 0.4, 3.0)])
 def test_the_start_is_the_quadrilateral_that_the_paint_fills(shape):
-    found = proposal_of(shape, {DIAMOND: 0.5, LANE_DASH: 0.5})
+    proposal = proposal_of(shape, {DIAMOND: 0.5, LANE_DASH: 0.5})
     true_px = order_corners(VIEW.undistort(to_image(VIEW.camera, shape)))
     turned = [np.roll(true_px, k, axis=0) for k in range(4)]
-    assert min(np.abs(found.corners_pinhole_px - t).max() for t in turned) < 3.0
-    assert found.fill > 0.85
+    assert min(np.abs(proposal.corners_pinhole_px - t).max() for t in turned) < 3.0
+    assert proposal.fill > 0.85
 
 
 def test_paint_beyond_the_range_starts_no_quadrilateral():
     blob = Blob({DIAMOND: 0.9}, np.ones((3, 3)), np.zeros(2), 2, to_image(VIEW.camera, along(RHOMBUS)))
-    (found,) = propose([blob], VIEW, CATALOGUE, 4.0)
-    assert found.kinds(CATALOGUE) == []
+    (proposal,) = propose([blob], VIEW, CATALOGUE, 4.0)
+    assert proposal.kinds(CATALOGUE) == []
 
 
 def test_a_side_along_the_border_is_open():
@@ -181,9 +181,9 @@ def test_diamonds_far_apart_may_be_turned_by_a_bend():
         around = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         return (diamond_at(0, 0) @ around) + (x, 0)
 
-    near = reported([diamond_at(4, 0), turned(6, 0.5)], [DIAMOND] * 2, [0.5, 0.9])["most_alike"][0]
+    diamond_near = reported([diamond_at(4, 0), turned(6, 0.5)], [DIAMOND] * 2, [0.5, 0.9])["most_alike"][0]
     far = reported([diamond_at(4, 0), turned(16, 0.5)], [DIAMOND] * 2, [0.5, 0.9])["most_alike"][0]
-    assert near < 0.05
+    assert diamond_near < 0.05
     assert far > 0.6
 
 
@@ -200,8 +200,8 @@ def test_a_doubtful_diamond_is_believed_among_others_like_it():
     field = np.stack([diamond_at(4.0 + 3 * k, 0) for k in range(4)])
     mixed = field.copy()
     mixed[1:] = 4 + 0.4 * (mixed[1:] - 4)
-    among, apart = (classify_among(odds, ground, kinds)[0] for ground in (field, mixed))
-    assert 1 - apart > 2 * (1 - among)
+    among, among_mixed = (classify_among(odds, ground, kinds)[0] for ground in (field, mixed))
+    assert 1 - among_mixed > 2 * (1 - among)
 
 
 def confidences(image, folder):
@@ -221,9 +221,9 @@ def test_a_round_soft_fleck_is_improbable_where_a_diamond_is_not(tmp_path, x):
     cv2.ellipse(image, centre, tuple(size.astype(int).tolist()), 0, 0, 360, 190, cv2.FILLED)
     soft = cv2.GaussianBlur(image, (0, 0), float(size[1] / 3))
     fleck = np.repeat(np.round(soft)[..., None], 3, axis=2).astype(np.uint8)
-    found = confidences(fleck, tmp_path)
-    assert found, "the network takes it for paint"
-    assert painted > DetectorOptions().min_confidence > max(found)
+    of_fleck = confidences(fleck, tmp_path)
+    assert of_fleck, "the network takes it for paint"
+    assert painted > DetectorOptions().min_confidence > max(of_fleck)
 
 
 def test_judge_and_weights_are_those_of_the_evidence_that_is_gathered():
@@ -257,6 +257,6 @@ def test_the_fit_of_the_weights_finds_those_that_made_the_data():
     evidence = rng.normal(size=(20000, 3)) * [1.0, 10.0, 0.1] + [0.0, 5.0, 1.0]
     weights, bias = np.array([1.0, -0.1, 8.0]), -7.0
     true = rng.random(20000) < 1 / (1 + np.exp(-evidence @ weights - bias))
-    found, found_bias = fit(evidence, true)
-    np.testing.assert_allclose(found, weights, rtol=0.1)
+    fitted, found_bias = fit(evidence, true)
+    np.testing.assert_allclose(fitted, weights, rtol=0.1)
     assert found_bias == pytest.approx(bias, rel=0.1)

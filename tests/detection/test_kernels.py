@@ -120,12 +120,14 @@ def test_the_same_pixels_are_looked_at_compiled_and_in_numpy(lens):
 
     for lattice, lattice_too in zip(*twice(lattices), strict=True):
         np.testing.assert_array_equal(lattice.count, lattice_too.count)
-        there = np.arange(lattice.use.shape[1]) < lattice.count
+        is_used = np.arange(lattice.use.shape[1]) < lattice.count
         for name, array in vars(lattice).items():
             array_too = getattr(lattice_too, name)
             assert (array.shape, array.dtype) == (array_too.shape, array_too.dtype), name
-            if array.shape[-1] == there.shape[-1]:
-                shown = np.broadcast_to(there.reshape(len(there), *[1] * (array.ndim - 2), -1), array.shape)
+            if array.shape[-1] == is_used.shape[-1]:
+                shown = np.broadcast_to(
+                    is_used.reshape(len(is_used), *[1] * (array.ndim - 2), -1), array.shape
+                )
                 array, array_too = array[shown], array_too[shown]
             np.testing.assert_allclose(array, array_too, atol=2e-5, err_msg=name)
 
@@ -137,11 +139,11 @@ def test_corners_are_the_same_compiled_and_in_numpy(lens):
     cut = open_sides(scene.start, scene.view)
 
     def fit():
-        found = fit_quadrilaterals(scene.patches, scene.view, scene.start, cut)
+        fitted = fit_quadrilaterals(scene.patches, scene.view, scene.start, cut)
         return (
-            found.corners_px,
-            np.sqrt(np.diagonal(found.covariance_px(), axis1=1, axis2=2)),
-            found.statistics,
+            fitted.corners_px,
+            np.sqrt(np.diagonal(fitted.covariance_px(), axis1=1, axis2=2)),
+            fitted.statistics,
         )
 
     (corners_px, sigma_px, statistics), (corners_px_too, sigma_px_too, statistics_too) = twice(fit)
@@ -246,11 +248,11 @@ def test_arrays_that_do_not_belong_together_are_refused():
 def _told(folder, *program, **environment):
     """The output of a new process, with the package from a folder."""
     environment = {native.SWITCH: "1", "PYTHONPATH": str(folder), **environment}
-    told = subprocess.run(
+    process = subprocess.run(
         [sys.executable, *program], cwd=folder, env=os.environ | environment,
         capture_output=True, text=True, timeout=60, check=True,
     )  # fmt: skip
-    return told.stdout + told.stderr
+    return process.stdout + process.stderr
 
 
 LOAD = "from v2hdm.detection.detector import Detector; Detector.load(); Detector.load()"
@@ -287,9 +289,9 @@ def test_kernels_of_another_processor_are_not_loaded_and_the_line_says_why(copie
     shutil.copytree(copied / "v2hdm", tmp_path / "v2hdm")
     suffix = next(s for s in EXTENSION_SUFFIXES if s.endswith("so"))
     (tmp_path / "v2hdm" / "native" / f"_kernels{suffix}").write_bytes(b"\x7fELF of another processor")
-    told = _told(tmp_path, "-c", LOAD)
-    assert told.startswith("the compiled kernels do not load (")
-    assert told.count("\n") == 1
+    answer = _told(tmp_path, "-c", LOAD)
+    assert answer.startswith("the compiled kernels do not load (")
+    assert answer.count("\n") == 1
 
 
 @compiled
@@ -304,9 +306,9 @@ def test_kernels_older_than_their_sources_are_not_used(copied, tmp_path):
 
 def test_a_compiler_that_fails_does_not_fail_the_install(copied, tmp_path):
     program = f"from hatchling import build; print(build.build_wheel({str(tmp_path)!r}))"
-    told = _told(copied, "-c", program, CXX="false", CC="false")
-    assert "v2hdm: detection will run in numpy, nothing was compiled: Command '['false'" in told
-    assert told.count("\n") == 2
+    answer = _told(copied, "-c", program, CXX="false", CC="false")
+    assert "v2hdm: detection will run in numpy, nothing was compiled: Command '['false'" in answer
+    assert answer.count("\n") == 2
     assert [path.name for path in tmp_path.iterdir()] == [f"v2hdm-{__version__}-py3-none-any.whl"]
 
 

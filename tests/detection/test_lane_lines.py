@@ -45,9 +45,9 @@ def test_every_line_is_found_where_it_is_and_numbered_outwards(view):
         -2: straight(view, -5.2),
     }
     paint = [painted(line, view, 5, 20) for line in lines.values()]
-    found = boundaries_of(anchors_of(view, list(lines.values())), view, paint)
-    assert sorted(lane.identity for lane in found) == [-2, -1, 1, 2]
-    for lane in found:
+    lines_found = boundaries_of(anchors_of(view, list(lines.values())), view, paint)
+    assert sorted(lane.identity for lane in lines_found) == [-2, -1, 1, 2]
+    for lane in lines_found:
         assert np.abs(off_px(lane, lines[lane.identity])).max() < 0.05
         assert (np.diff(lane.points_px[:, 1]) < 0).all(), "from near to far"
         assert lane.score > 0.85
@@ -79,14 +79,14 @@ def test_the_gap_between_two_dashes_does_not_break_a_line(view):
 
 
 def test_lines_that_run_side_by_side_are_not_joined_across_a_gap(view):
-    near, far = straight(view, 1.6), straight(view, 3.2)
+    near_line, far = straight(view, 1.6), straight(view, 3.2)
     rows = [
         row
-        for line, part in ((near, lambda v: v > 230), (far, lambda v: v < 215))
+        for line, part in ((near_line, lambda v: v > 230), (far, lambda v: v < 215))
         for row in anchors_of(view, [line])
         if part(row.v_px)
     ]
-    paint = [painted(near, view, 4, 7), painted(far, view, 12, 16)]
+    paint = [painted(near_line, view, 4, 7), painted(far, view, 12, 16)]
     assert len(boundaries_of(rows, view, paint)) == 2
 
 
@@ -136,16 +136,16 @@ def test_crossings_too_unlikely_by_themselves_carry_a_known_line_on(view):
 def test_a_double_line_is_one_boundary_along_its_middle(view):
     pair = [straight(view, 1.5), straight(view, 1.9)]
     (lane,) = boundaries_of(anchors_of(view, pair), view, [painted(line, view, 5, 15) for line in pair])
-    near = straight(view, 1.7)
-    assert np.abs(off_px(lane, near[near[:, 1] > 200])).max() < 2
+    true_line = straight(view, 1.7)
+    assert np.abs(off_px(lane, true_line[true_line[:, 1] > 200])).max() < 2
 
 
 def test_a_single_dash_beside_a_long_solid_line_makes_a_double_one(view):
     pair = [straight(view, 1.5), straight(view, 1.9)]
     paint = [painted(pair[0], view, 5, 20), painted(pair[1], view, 7, 9.5)]
     (lane,) = boundaries_of(anchors_of(view, pair), view, paint)
-    near = straight(view, 1.7)
-    assert np.abs(off_px(lane, near[near[:, 1] > 200])).max() < 2
+    true_line = straight(view, 1.7)
+    assert np.abs(off_px(lane, true_line[true_line[:, 1] > 200])).max() < 2
 
 
 def test_what_a_point_errs_by_is_within_its_stated_sigma(view):
@@ -191,7 +191,7 @@ def cluttered(view, rows, seed, odds):
     """The rows with eight crossings of such log odds on each, anywhere."""
     rng, width = np.random.default_rng(seed), view.info.width
     more = ((np.append(row.u_px, rng.uniform(0, width, 8)), np.append(row.odds, [odds] * 8)) for row in rows)
-    return [AnchorRow(row.v_px, *given) for row, given in zip(rows, more, strict=True)]
+    return [AnchorRow(row.v_px, *columns) for row, columns in zip(rows, more, strict=True)]
 
 
 def scores(view, rows):
@@ -210,16 +210,16 @@ def test_crossings_all_over_the_ground_make_lines_less_sure(view):
 def test_a_line_a_lane_away_makes_one_surer_and_one_too_near_does_not(view):
     line = straight(view, 1.6)
     alone = score_of(view, anchors_of(view, [line]))
-    near, away = (min(scores(view, anchors_of(view, [line, straight(view, y)]))) for y in (0.6, -1.7))
+    too_near, away = (min(scores(view, anchors_of(view, [line, straight(view, y)]))) for y in (0.6, -1.7))
     assert away > alone + 0.05
-    assert near < alone - 0.05
+    assert too_near < alone - 0.05
 
 
 def test_a_line_a_lane_away_that_runs_another_way_tells_nothing(view):
     line = straight(view, 1.6)
     other = to_image(view.camera, np.linspace((6.0, -1.0), (30.0, -9.0), 100))
-    found = boundaries_of(anchors_of(view, [line, other]), view)
-    mine = min(found, key=lambda lane: np.abs(off_px(lane, line)).max())
+    lines_found = boundaries_of(anchors_of(view, [line, other]), view)
+    mine = min(lines_found, key=lambda lane: np.abs(off_px(lane, line)).max())
     assert mine.score == pytest.approx(score_of(view, anchors_of(view, [line])), abs=0.05)
 
 
@@ -241,12 +241,12 @@ def test_paint_that_the_network_sees_along_it_makes_a_line_surer(view):
 def test_the_paint_along_a_line_is_the_mean_of_where_it_is_seen(view):
     line = straight(view, 1.6)
     rows = anchors_of(view, [line])
-    near = line[line[:, 1] > np.mean([rows[0].v_px, rows[-1].v_px])]
+    near_part = line[line[:, 1] > np.mean([rows[0].v_px, rows[-1].v_px])]
     points, lines = propose(LaneImage(view, rows), -np.inf)
     column = score.ALONE.index("paint_along")
     whole, half, none = (
         score.features_alone(lines, points, LaneImage(view, rows, (), painted_on(view, parts)))[0, column]
-        for parts in ([line], [near], [])
+        for parts in ([line], [near_part], [])
     )
     assert whole == pytest.approx(5, abs=0.5)
     assert half == pytest.approx(0, abs=1.5)

@@ -55,9 +55,9 @@ def test_several_priors_at_once_tell_what_each_does_alone(view):
     np.testing.assert_allclose(at_once, [evidence.log_evidence(prior) for prior in priors], rtol=1e-12)
     curves = evidence.curves(priors, 640.0)
     alone = [evidence[k : k + 1].curves([prior], 640.0)[0] for k, prior in enumerate(priors)]
-    for one, other in zip(curves, alone, strict=True):
-        np.testing.assert_allclose(one.parameters, other.parameters, rtol=1e-9)
-        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-9)
+    for curve, other in zip(curves, alone, strict=True):
+        np.testing.assert_allclose(curve.parameters, other.parameters, rtol=1e-9)
+        np.testing.assert_allclose(curve.covariance, other.covariance, rtol=1e-9)
 
 
 @pytest.mark.parametrize("curvature", [0.0, 0.006, -0.006])
@@ -73,13 +73,13 @@ def test_the_road_is_what_most_lines_agree_on_not_the_longest_other_one(view, cu
 def test_short_dashes_far_away_point_where_the_line_beside_them_does(view):
     line, horizon = straight(view, 1.6), view.horizon
     dashes = [tilted(painted(line, view, *span), 0.7) for span in ((12, 14), (17, 19))]
-    near = line[(line[:, 1] > 200) & view.inside(line, 0)]
+    near_part = line[(line[:, 1] > 200) & view.inside(line, 0)]
     off = []
     for beside in ([], [straight(view, -1.8)]):
         points, lines = propose(LaneImage(view, anchors_of(view, beside), dashes), -np.inf)
-        along, below = horizon.coordinates(view.undistort(near))
+        along, below = horizon.coordinates(view.undistort(near_part))
         curves = [
-            each.curve.along(horizon.basis(below)) for each in lines if points.is_paint[each.members].all()
+            line.curve.along(horizon.basis(below)) for line in lines if points.is_paint[line.members].all()
         ]
         off.append(min(np.abs(curve - along).max() for curve in curves))
     assert off[1] < 8
@@ -109,8 +109,8 @@ def test_a_stroke_across_a_line_does_not_draw_it_to_the_middle(view):
 
 
 def test_a_line_whose_far_half_bends_away_a_little_stays_one(view):
-    near = straight(view, 1.6)
-    rows = anchors_of(view, [near])
+    near_line = straight(view, 1.6)
+    rows = anchors_of(view, [near_line])
     split = rows[len(rows) // 2].v_px
     bent = [AnchorRow(r.v_px, r.u_px + (4.0 if r.v_px < split else 0.0), r.odds) for r in rows]
     (lane,) = boundaries_of(bent, view)
@@ -143,8 +143,11 @@ def test_where_one_strand_has_ended_the_line_passes_to_the_other(view):
     rows, paint, lines = as_seen(view, ENDS_M, LANE_LINE)
     (lane,) = boundaries_of(rows, view, paint, output=painted_on(view, lines))
     middle = straight(view, (LEFT_M + RIGHT_M) / 2)
-    near, far = part_of(view, straight(view, RIGHT_M), 4, ENDS_M - 3), part_of(view, middle, ENDS_M + 3, 24)
-    assert np.abs(off_px(lane, near)).max() < 10, "the middle is 26 px away"
+    near_strand, far = (
+        part_of(view, straight(view, RIGHT_M), 4, ENDS_M - 3),
+        part_of(view, middle, ENDS_M + 3, 24),
+    )
+    assert np.abs(off_px(lane, near_strand)).max() < 10, "the middle is 26 px away"
     assert np.abs(off_px(lane, far)).max() < 1
     assert np.abs(np.diff(lane.points_px[:, 0], 2)).max() < 12, "without a step"
 
@@ -163,14 +166,14 @@ def test_solid_line_ends_where_its_paint_does(view, paint_to_m, ends):
     line = straight(view, 1.6)
     solid = replace(painted(line, view, 12, 26), kind=LANE_LINE)
     sure = anchors_of(view, [part_of(view, line, 12, 40)])
-    near = [row for row in anchors_of(view, [line]) if row.v_px > sure[0].v_px]
-    near = [AnchorRow(row.v_px, row.u_px, np.array([-2.5])) for row in near]
+    near_rows = [row for row in anchors_of(view, [line]) if row.v_px > sure[0].v_px]
+    near_rows = [AnchorRow(row.v_px, row.u_px, np.array([-2.5])) for row in near_rows]
     output = painted_on(view, [part_of(view, line, paint_to_m, 40)])
-    (lane,) = boundaries_of([*near, *sure], view, [solid], output=output)
+    (lane,) = boundaries_of([*near_rows, *sure], view, [solid], output=output)
     if ends:
         assert lane.points_px[0, 1] < solid.points_px[0, 1] + 20
     else:
-        assert lane.points_px[0, 1] > near[0].v_px - 20
+        assert lane.points_px[0, 1] > near_rows[0].v_px - 20
 
 
 @pytest.mark.parametrize("kind", [LANE_LINE, LANE_DASH])

@@ -52,14 +52,14 @@ def test_a_gpu_that_this_onnxruntime_was_built_without_is_told(monkeypatch):
 
 
 def test_a_gpu_that_does_not_start_is_told_and_not_left_out_in_silence(monkeypatch):
-    there = ["CUDAExecutionProvider", "CPUExecutionProvider"]
+    available = ["CUDAExecutionProvider", "CPUExecutionProvider"]
     original = onnxruntime.InferenceSession
 
     def without(path, options, providers):
-        assert [one if isinstance(one, str) else one[0] for one in providers] == there
+        assert [provider if isinstance(provider, str) else provider[0] for provider in providers] == available
         return original(path, options, providers=["CPUExecutionProvider"])
 
-    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: there)
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: available)
     monkeypatch.setattr("onnxruntime.InferenceSession", without)
     with pytest.raises(DetectorError, match="could not start CUDAExecutionProvider: check the driver"):
         Detector.load(options=DetectorOptions(device="cuda"))
@@ -94,8 +94,8 @@ def test_a_model_with_wrong_metadata_is_refused(tmp_path, metadata, words):
 
 def test_metadata_nested_deeper_than_any_is_refused_in_one_line(tmp_path):
     model = onnx.load(brightness_model(tmp_path))
-    (own,) = [one for one in model.metadata_props if one.key == "v2hdm"]
-    own.value = "[" * 3000 + "]" * 3000
+    (entry,) = [metadata for metadata in model.metadata_props if metadata.key == "v2hdm"]
+    entry.value = "[" * 3000 + "]" * 3000
     onnx.save(model, tmp_path / "deep.onnx")
     with pytest.raises(DetectorError, match="nested deeper"):
         Network(tmp_path / "deep.onnx")
@@ -161,8 +161,11 @@ def test_both_resolutions_say_the_same_of_the_same_place(tmp_path):
     once = run_on_road(network, image, view)
     assert twice.paint.shape == once.paint.shape
     assert twice.kinds.shape == once.kinds.shape
-    both, either = ((once.paint > 0) & (twice.paint > 0)).sum(), ((once.paint > 0) | (twice.paint > 0)).sum()
-    assert both / either > 0.97
+    overlap, either = (
+        ((once.paint > 0) & (twice.paint > 0)).sum(),
+        ((once.paint > 0) | (twice.paint > 0)).sum(),
+    )
+    assert overlap / either > 0.97
     centres = [np.argwhere(sight.paint > 0).mean(axis=0) for sight in (once, twice)]
     np.testing.assert_allclose(*centres, atol=0.1)
 
@@ -206,8 +209,8 @@ def test_with_its_mirror_image_the_network_says_the_same_of_both_sides():
     np.testing.assert_allclose(mirrored.paint[:, ::-1], direct.paint, atol=1e-4)
     np.testing.assert_allclose(mirrored.kinds[..., ::-1], direct.kinds, atol=1e-4)
     columns = [[np.sort(row.u_px) for row in sight.anchors] for sight in (direct, mirrored)]
-    for there, here in zip(*columns, strict=True):
-        np.testing.assert_allclose(np.sort(image.shape[1] - 1 - here), there, atol=1e-3)
+    for column, here in zip(*columns, strict=True):
+        np.testing.assert_allclose(np.sort(image.shape[1] - 1 - here), column, atol=1e-3)
     once = looked_at(image, False)
     assert np.abs(looked_at(image[:, ::-1].copy(), False).paint[:, ::-1] - once.paint).max() > 0.1
 
@@ -217,8 +220,11 @@ def test_the_mirror_image_moves_nothing_whatever_the_width(width):
     image = picture(large_camera(width, 720), [diamond(6.0, 1.0), diamond(8.0, -1.5)])
     once, twice = looked_at(image, False), looked_at(image, True)
     assert (twice.paint.shape, twice.kinds.shape) == (once.paint.shape, once.kinds.shape)
-    both, either = ((once.paint > 0) & (twice.paint > 0)).sum(), ((once.paint > 0) | (twice.paint > 0)).sum()
-    assert both / either > 0.93
+    overlap, either = (
+        ((once.paint > 0) & (twice.paint > 0)).sum(),
+        ((once.paint > 0) | (twice.paint > 0)).sum(),
+    )
+    assert overlap / either > 0.93
     # Each marking's own centre: that of both together would also move with how large each comes out.
     centres = [
         cv2.connectedComponentsWithStats((sight.paint > 0).astype(np.uint8))[3][1:] for sight in (once, twice)
@@ -243,9 +249,9 @@ def test_a_stripe_across_the_view_of_a_camera_that_looks_to_the_side_is_a_dash(t
     camera = make_camera("pinhole")
     image = picture(camera, [bar(6.0, 0.0, 0.3, 2.4)], ground=0.2, paint=0.6)
     detector = Detector.load(brightness_model(tmp_path, STOP_LINE), DetectorOptions(min_confidence=0.0))
-    (seen,) = detector.detect(image, turned(camera, yaw_deg))[0]
-    assert seen.kind == kind
-    assert seen.score > DetectorOptions().min_confidence
+    (detection,) = detector.detect(image, turned(camera, yaw_deg))[0]
+    assert detection.kind == kind
+    assert detection.score > DetectorOptions().min_confidence
 
 
 @pytest.fixture
@@ -313,11 +319,11 @@ def test_a_detector_is_not_loaded_from_files_that_do_not_belong_together(monkeyp
 
 
 def test_the_user_of_an_own_network_is_told_whose_judge_scores_it(tmp_path):
-    own = tmp_path / "own.onnx"
-    own.write_bytes(weights.NETWORK_FILE.read_bytes())
-    assert weights.unknown_network(own) is None
-    own.write_bytes(b"another network")
-    message = weights.unknown_network(own)
+    network = tmp_path / "own.onnx"
+    network.write_bytes(weights.NETWORK_FILE.read_bytes())
+    assert weights.unknown_network(network) is None
+    network.write_bytes(b"another network")
+    message = weights.unknown_network(network)
     assert message is not None
     assert "judge of the shipped network" in message
     assert "\n" not in message
@@ -356,6 +362,6 @@ def test_a_model_newer_than_the_runtime_is_one_line_with_both_versions(change, s
 def test_the_hint_of_a_users_network_is_to_fit_with_that_network(tmp_path):
     mine = tmp_path / "my network.onnx"
     mine.write_bytes(b"another")
-    told = weights.unknown_network(mine)
-    assert told is not None
-    assert f"fit it with `python -m train.ship '{mine}'`" in told
+    hint = weights.unknown_network(mine)
+    assert hint is not None
+    assert f"fit it with `python -m train.ship '{mine}'`" in hint

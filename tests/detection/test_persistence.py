@@ -31,8 +31,8 @@ def drive(place, step_m=1.5, count=8, sigma_deg=1.0):
 
 def stays(views, number=0):
     """How often the thing of a number is taken to stay on the ground."""
-    kept = [mask for _, mask in settled(views, lambda view: ("front", view))]
-    return [bool(mask[number]) for mask in kept]
+    masks = [mask for _, mask in settled(views, lambda view: ("front", view))]
+    return [bool(mask[number]) for mask in masks]
 
 
 def paint(way_m):
@@ -78,8 +78,8 @@ def test_an_image_from_which_paint_is_beyond_the_range_tells_nothing():
         View(view.map_from_vehicle, CAMERA, view.markings if k > 5 else [], reach_m=13.0)
         for k, view in enumerate(views)
     ]
-    kept = [mask for _, mask in settled(shown, lambda view: ("front", view)) if len(mask)]
-    assert np.concatenate(kept).all()
+    masks = [mask for _, mask in settled(shown, lambda view: ("front", view)) if len(mask)]
+    assert np.concatenate(masks).all()
 
 
 def test_while_the_vehicle_stands_nothing_is_doubted():
@@ -90,8 +90,8 @@ def test_while_the_vehicle_stands_nothing_is_doubted():
 def test_an_image_of_another_camera_tells_nothing():
     views = drive(lambda way: (6.0, 0.5), count=4)
     names = iter("abcd")
-    kept = [mask for _, mask in settled(views, lambda view: (next(names), view))]
-    assert np.concatenate(kept).all()
+    masks = [mask for _, mask in settled(views, lambda view: (next(names), view))]
+    assert np.concatenate(masks).all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 12])

@@ -44,19 +44,19 @@ def test_what_lies_in_a_region_is_found_as_in_the_whole_image_and_nothing_else(d
     assert len(markings) == 3
     for marking in markings:
         regions_px = (box_of(marking) + AROUND_PX)[None]
-        (found,) = detector.detect_in_regions(image, make_camera(), regions_px)
-        assert found.kind == marking.kind
-        np.testing.assert_allclose(found.corners_px, marking.corners_px, atol=0.05)
-        np.testing.assert_allclose(found.covariance_px, marking.covariance_px, rtol=0.3, atol=0.02)
+        (detection,) = detector.detect_in_regions(image, make_camera(), regions_px)
+        assert detection.kind == marking.kind
+        np.testing.assert_allclose(detection.corners_px, marking.corners_px, atol=0.05)
+        np.testing.assert_allclose(detection.covariance_px, marking.covariance_px, rtol=0.3, atol=0.02)
 
 
 def test_all_regions_at_once_find_all(detector, image):
     markings = whole(detector, image)
     regions_px = np.array([box_of(marking) + AROUND_PX for marking in markings])
-    found = detector.detect_in_regions(image, make_camera(), regions_px)
-    found = sorted(found, key=lambda marking: -marking.corners_px[:, 1].max())
-    assert [marking.kind for marking in found] == [marking.kind for marking in markings]
-    for part, marking in zip(found, markings, strict=True):
+    detections = detector.detect_in_regions(image, make_camera(), regions_px)
+    detections = sorted(detections, key=lambda marking: -marking.corners_px[:, 1].max())
+    assert [marking.kind for marking in detections] == [marking.kind for marking in markings]
+    for part, marking in zip(detections, markings, strict=True):
         np.testing.assert_allclose(part.corners_px, marking.corners_px, atol=0.05)
 
 
@@ -95,10 +95,10 @@ def test_boxes_that_overlap_become_one_and_none_is_lost():
 def test_a_road_detector_takes_regions(detector, image):
     road = RoadDetector(detector, make_camera())
     marking = whole(detector, image)[2]
-    found = road.detect(image, regions_px=(box_of(marking) + AROUND_PX)[None])
-    assert len(found.markings) == 1
-    assert found.lanes == ()
-    assert not found.is_whole
+    in_image = road.detect(image, regions_px=(box_of(marking) + AROUND_PX)[None])
+    assert len(in_image.markings) == 1
+    assert in_image.lanes == ()
+    assert not in_image.is_whole
     assert road.detect(image).is_whole
 
 

@@ -85,21 +85,21 @@ def test_paint_that_is_hardly_any_has_an_outline_too():
 def test_an_outline_moves_to_the_edges_of_bright_paint_and_stays_where_there_are_none(turned):
     true = np.array([[30.4, 20.3], [90.4, 20.3], [90.4, 50.3], [30.4, 50.3]])
     columns, rows = (
-        np.clip(one, 0.0, 1.0)
-        for one in (
+        np.clip(shape, 0.0, 1.0)
+        for shape in (
             np.minimum(np.arange(120) + 0.5 - 30.4, 90.9 - np.arange(120)),
             np.minimum(np.arange(80) + 0.5 - 20.3, 50.8 - np.arange(80)),
         )
     )
     picture = np.repeat((70 + 110 * rows[:, None] * columns)[..., None], 3, axis=2).astype(np.uint8)
     drawn = (true + np.array([[-2.0, 1.5], [1.5, -2.0], [2.0, 2.0], [1.0, -1.5]]))[::turned]
-    found, seen = on_edges(drawn, picture)
-    assert seen.all()
+    outline_px, has_edge = on_edges(drawn, picture)
+    assert has_edge.all()
     middles = (true + np.roll(true, -1, axis=0)) / 2
-    off_px = [cv2.pointPolygonTest(found.astype(np.float32), one, True) for one in middles.tolist()]
+    off_px = [cv2.pointPolygonTest(outline_px.astype(np.float32), point, True) for point in middles.tolist()]
     np.testing.assert_allclose(off_px, 0.0, atol=0.4)
-    plain, seen = on_edges(drawn, np.full_like(picture, 70))
-    assert not seen.any()
+    plain, has_edge = on_edges(drawn, np.full_like(picture, 70))
+    assert not has_edge.any()
     assert abs(signed_area(plain) - signed_area(drawn)) < 0.02 * abs(signed_area(drawn))
 
 
@@ -107,23 +107,25 @@ def test_an_outline_has_no_edge_where_paint_runs_on_beyond_it():
     picture = np.full((80, 120, 3), 60, dtype=np.uint8)
     picture[20:50, 30:] = 180
     picture[40:] //= 3  # a shadow
-    found, seen = on_edges(np.array([[30.0, 20.0], [80.0, 20.0], [80.0, 50.0], [30.0, 50.0]]), picture)
-    middles = (found + np.roll(found, -1, axis=0)) / 2
-    length = np.linalg.norm(found - np.roll(found, -1, axis=0), axis=1)
+    outline_px, has_edge = on_edges(
+        np.array([[30.0, 20.0], [80.0, 20.0], [80.0, 50.0], [30.0, 50.0]]), picture
+    )
+    middles = (outline_px + np.roll(outline_px, -1, axis=0)) / 2
+    length = np.linalg.norm(outline_px - np.roll(outline_px, -1, axis=0), axis=1)
     cut = np.abs(middles[:, 0] - 80.0) < 3
-    assert length[seen & cut].sum() < 0.2 * length[cut].sum()
-    assert length[seen & ~cut].sum() > 0.9 * length[~cut].sum()
+    assert length[has_edge & cut].sum() < 0.2 * length[cut].sum()
+    assert length[has_edge & ~cut].sum() > 0.9 * length[~cut].sum()
 
 
-@pytest.mark.parametrize(("other", "one"), [("stop_line", False), ("diamond", True), ("lane_dash", True)])
-def test_an_arrow_and_a_stop_line_are_two_markings_but_a_shaft_is_part_of_its_arrow(other, one):
+@pytest.mark.parametrize(("other", "is_one"), [("stop_line", False), ("diamond", True), ("lane_dash", True)])
+def test_an_arrow_and_a_stop_line_are_two_markings_but_a_shaft_is_part_of_its_arrow(other, is_one):
     labels = np.zeros((60, 60), dtype=int)
     labels[5:25, 20:40] = 1 + PAINT_CLASSES.index("arrow")
     labels[25:50, 25:45] = 1 + PAINT_CLASSES.index(other)
     blobs, _ = find_blobs(output_of_labels(labels))
     pieces = [Proposal(blob, k, {}, np.zeros((0, 2)), None, 0.0) for k, blob in enumerate(blobs)]
     assert pieces[0].blob.parts == 2
-    assert pieces[0].is_one_symbol(pieces[1:], SHIPPED) == one
+    assert pieces[0].is_one_symbol(pieces[1:], SHIPPED) == is_one
 
 
 def test_a_diamond_that_touches_a_line_is_split_from_it():

@@ -45,13 +45,13 @@ def document(name: str) -> str:
 def blocks(name: str, *languages: str) -> list[Block]:
     """The blocks of a document in their order, of the ``languages`` if any are named."""
     text = document(name)
-    found = []
+    blocks_of_page = []
     for fence in _FENCE.finditer(text):
         language, info, body = fence.groups()
         title = _TITLE.search(info)
         line = text.count("\n", 0, fence.start()) + 2
-        found.append(Block(name, line, language, title.group(1) if title else "", body))
-    return [one for one in found if not languages or one.language in languages]
+        blocks_of_page.append(Block(name, line, language, title.group(1) if title else "", body))
+    return [block for block in blocks_of_page if not languages or block.language in languages]
 
 
 def documents() -> list[str]:

@@ -72,12 +72,12 @@ def serve(address: str) -> None:
     # What has ended is waited for, so that its CPU time is part of what the tests took.
     signal.signal(signal.SIGCHLD, lambda *_: _wait_for_the_ended())
     while True:
-        asked, _ = listening.accept()
+        connection, _ = listening.accept()
         if os.fork() == 0:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             listening.close()
-            _work(asked)
-        asked.close()
+            _work(connection)
+        connection.close()
 
 
 def _wait_for_the_ended() -> None:
@@ -86,13 +86,13 @@ def _wait_for_the_ended() -> None:
             pass
 
 
-def _work(asked: socket.socket) -> None:
+def _work(connection: socket.socket) -> None:
     """Be ``python ARGUMENTS`` on the asker's terminal, and end."""
-    _, passed, _, _ = socket.recv_fds(asked, 1, 3)
+    _, passed, _, _ = socket.recv_fds(connection, 1, 3)
     for number, fd in enumerate(passed):
         os.dup2(fd, number)
         os.close(fd)
-    arguments, folder, environment = json.loads(b"".join(iter(lambda: asked.recv(65536), b"")))
+    arguments, folder, environment = json.loads(b"".join(iter(lambda: connection.recv(65536), b"")))
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
@@ -111,7 +111,7 @@ def _work(asked: socket.socket) -> None:
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):
                 stream.flush()
-        asked.sendall(str(code).encode())
+        connection.sendall(str(code).encode())
         os._exit(0)
 
 

@@ -11,15 +11,15 @@ SMALL_PORT = (
 
 def smaller(arguments: list[str]) -> list[str]:
     """The arguments of ``v2hdm`` with what makes the command small."""
-    name, given = arguments[0], arguments[1:]
-    if (name in ("check", "localize") and "--list-topics" not in given) or given[:1] == ["ground"]:
+    name, options = arguments[0], arguments[1:]
+    if (name in ("check", "localize") and "--list-topics" not in options) or options[:1] == ["ground"]:
         return [*arguments, "--workers", "1"]
-    if name not in ("map", "simulate") or "--cfg=job" in given:
+    if name not in ("map", "simulate") or "--cfg=job" in options:
         return arguments
-    ports = [one for one in given if one.startswith("+run=port")]
+    ports = [option for option in options if option.startswith("+run=port")]
     small = [*(SMALL_PORT if ports else ()), "workers=1"]
-    if name == "map" and given != ["+run=port2"]:  # that of `make map` shows the mosaic, once for all
+    if name == "map" and options != ["+run=port2"]:  # that of `make map` shows the mosaic, once for all
         small.append("mosaic=false")
-    if any(argument.startswith("drive.path=bench/") for argument in given):
+    if any(argument.startswith("drive.path=bench/") for argument in options):
         small.append("drive.limit=40")
     return [*arguments, *small]

@@ -155,22 +155,22 @@ def test_what_is_not_run_names_commands_and_settings_that_are_there(block, shell
             continue
         module, *arguments = shlex.split(called.group(1))
         if module == "v2hdm":
-            name = next(one for one in command_names() if " ".join(arguments).startswith(one))
+            name = next(command for command in command_names() if " ".join(arguments).startswith(command))
             program, arguments = ["v2hdm", *name.split()], arguments[len(name.split()) :]
             module = f"v2hdm.cli.commands.{name.replace(' ', '_')}"
         else:
             name, program = module.removeprefix("v2hdm."), ["python", "-m", module]
         assert importlib.util.find_spec(module) is not None, line
         if name in COMPOSED:
-            own = ROOT / "docs" / "own-class"
-            arguments = [one.replace("docs/own-class", str(own)) for one in arguments]
+            own_class = ROOT / "docs" / "own-class"
+            arguments = [argument.replace("docs/own-class", str(own_class)) for argument in arguments]
             assert shell(shlex.join([*program, *arguments, "--cfg=job"]), tmp_path)
         else:
             # Commands that share an option have it from one place.
             of_command = [*_sources(module), ROOT / "v2hdm" / "cli" / "arguments.py"]
             source = "".join(path.read_text() for path in of_command)
-            options = [one for one in arguments if one.startswith("--")]
-            assert all(f'"{one}"' in source for one in options), line
+            options = [argument for argument in arguments if argument.startswith("--")]
+            assert all(f'"{option}"' in source for option in options), line
 
 
 def _sources(module):
@@ -186,7 +186,7 @@ def test_a_document_names_only_modules_extras_and_targets_that_are_there(name):
     for name in re.findall(r"(?:`|^)v2hdm ((?:calibrate|benchmark) [a-z]+|[a-z]+)\b", text, re.MULTILINE):
         assert name in command_names(), name
     for listed in re.findall(r"(?:\.|v2hdm|\.whl)\[([a-z, ]+)\]'", text):
-        assert {one.strip() for one in listed.split(",")} <= set(EXTRAS), listed
+        assert {extra.strip() for extra in listed.split(",")} <= set(EXTRAS), listed
     targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert set(re.findall(r"`make ([a-z]+)", text)) <= set(targets)
     for version in re.findall(r"v2hdm-([\d.]+)-py3", text):

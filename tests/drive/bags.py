@@ -161,14 +161,14 @@ class Messages:
         )  # fmt: skip
 
     def transforms(self, stamp_s: float, edges: Mapping[tuple[str, str], FloatArray]) -> Any:
-        made = []
+        stamped = []
         for (parent, child), matrix in edges.items():
             x, y, z = matrix[:3, 3].tolist()
             move, turn = self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z), self.pose(matrix).orientation
-            both = self.make("geometry_msgs/msg/Transform", translation=move, rotation=turn)
-            fields = {"header": self.header(stamp_s, parent), "child_frame_id": child, "transform": both}
-            made.append(self.make("geometry_msgs/msg/TransformStamped", **fields))
-        return self.make("tf2_msgs/msg/TFMessage", transforms=made)
+            motion = self.make("geometry_msgs/msg/Transform", translation=move, rotation=turn)
+            fields = {"header": self.header(stamp_s, parent), "child_frame_id": child, "transform": motion}
+            stamped.append(self.make("geometry_msgs/msg/TransformStamped", **fields))
+        return self.make("tf2_msgs/msg/TFMessage", transforms=stamped)
 
 
 def messages_of(
@@ -179,7 +179,7 @@ def messages_of(
 ) -> Messages:
     """The drive in ``folder``: raw images of ``front``, those of ``rear`` as they are, odometry, frames."""
     drive = read_drive(folder)
-    made = Messages(ros1)
+    messages = Messages(ros1)
     assert drive.trajectory is not None
     for image in drive.images:
         frame = f"{image.camera}_optical"
@@ -187,56 +187,56 @@ def messages_of(
         if image.camera == "front":
             pixels = cv2.imread(str(image.path), cv2.IMREAD_COLOR)
             rgb = np.ascontiguousarray(pixels[..., ::-1])
-            made.add(image.stamp_s, topic, made.raw_image(image.stamp_s, rgb, "rgb8", frame, pad=5))
+            messages.add(image.stamp_s, topic, messages.raw_image(image.stamp_s, rgb, "rgb8", frame, pad=5))
         else:
             data = image.path.read_bytes()
-            packed = made.compressed(image.stamp_s, data, "jpeg", frame)
-            made.add(image.stamp_s, f"{topic}/compressed", packed)
-        info = made.info(image.stamp_s, drive.cameras[image.camera].info, frame)
-        made.add(image.stamp_s, f"/sensing/{image.camera}/camera_info", info)
+            packed = messages.compressed(image.stamp_s, data, "jpeg", frame)
+            messages.add(image.stamp_s, f"{topic}/compressed", packed)
+        info = messages.info(image.stamp_s, drive.cameras[image.camera].info, frame)
+        messages.add(image.stamp_s, f"/sensing/{image.camera}/camera_info", info)
     for stamp_s, pose in zip(drive.trajectory.stamp_s, drive.trajectory.map_from_vehicle, strict=True):
-        made.add(stamp_s, "/odom", made.odometry(stamp_s, pose, np.zeros(36), "base_link"))
+        messages.add(stamp_s, "/odom", messages.odometry(stamp_s, pose, np.zeros(36), "base_link"))
     if fixed_frames:
         edges = {
             ("base_link", f"{name}_optical"): inverse(np.array(guess))
             for name, guess in (mounted or mountings()).items()
         }
         first_s = drive.trajectory.stamp_s[0]
-        made.add(first_s, "/tf_static", made.transforms(first_s, edges))
-    made.rows.sort(key=lambda row: row[0])
-    return made
+        messages.add(first_s, "/tf_static", messages.transforms(first_s, edges))
+    messages.rows.sort(key=lambda row: row[0])
+    return messages
 
 
 def mountings() -> dict[str, FloatArray]:
     return {"front": looking_forward(2.0), "rear": looking_forward(3.0)}
 
 
-def write_ros1(path: Path, made: Messages, compression: str | None = None) -> Path:
+def write_ros1(path: Path, messages: Messages, compression: str | None = None) -> Path:
     path = path.with_suffix(".bag")
     writer = Writer1(path)
     if compression:
         writer.set_compression(Writer1.CompressionFormat[compression.upper()])
     with writer:
-        _write(writer, made, ROS1.serialize_ros1, ROS1)
+        _write(writer, messages, ROS1.serialize_ros1, ROS1)
     return path
 
 
 def write_ros2(
     path: Path,
-    made: Messages,
+    messages: Messages,
     storage: StoragePlugin = StoragePlugin.MCAP,
     compression: CompressionMode = CompressionMode.NONE,
 ) -> Path:
     writer = Writer2(path, version=9, storage_plugin=storage)
     writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
-        _write(writer, made, ROS2.serialize_cdr, ROS2)
+        _write(writer, messages, ROS2.serialize_cdr, ROS2)
     return path
 
 
-def _write(writer: Any, made: Messages, serialize: Callable[..., Any], store: Any) -> None:
+def _write(writer: Any, messages: Messages, serialize: Callable[..., Any], store: Any) -> None:
     connections: dict[str, Any] = {}
-    for stamp_s, topic, message in made.rows:
+    for stamp_s, topic, message in messages.rows:
         if topic not in connections:
             connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
         data = serialize(message, message.__msgtype__)
@@ -246,8 +246,8 @@ def _write(writer: Any, made: Messages, serialize: Callable[..., Any], store: An
 def assert_same_drive(got: Drive, expected: Drive) -> None:
     """Poses to a micrometre, pixels and times to the last bit."""
     assert_same_poses(got, expected)
-    for one, other in zip(got.images, expected.images, strict=True):
-        np.testing.assert_array_equal(cv2.imread(str(one.path)), cv2.imread(str(other.path)))
+    for image, other in zip(got.images, expected.images, strict=True):
+        np.testing.assert_array_equal(cv2.imread(str(image.path)), cv2.imread(str(other.path)))
     for name, camera in expected.cameras.items():
         info = got.cameras[name].info
         assert info.name == name
@@ -259,9 +259,9 @@ def assert_same_drive(got: Drive, expected: Drive) -> None:
 
 
 def assert_same_poses(got: Drive, expected: Drive) -> None:
-    for one, other in zip(got.images, expected.images, strict=True):
-        assert (one.camera, one.stamp_s) == (other.camera, other.stamp_s)
-        np.testing.assert_allclose(one.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
+    for image, other in zip(got.images, expected.images, strict=True):
+        assert (image.camera, image.stamp_s) == (other.camera, other.stamp_s)
+        np.testing.assert_allclose(image.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
 
 
 def assert_mounted(got: Drive) -> None:

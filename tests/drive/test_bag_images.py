@@ -37,10 +37,10 @@ def folder(tmp_path_factory):
     ("encoding", "channels"), [("mono8", 1), ("bgr8", 3), ("rgb8", 3), ("bgra8", 4), ("rgba8", 4)]
 )
 def test_raw_images_keep_every_bit(encoding, channels):
-    made = Messages()
+    messages = Messages()
     pixels = np.random.default_rng(1).integers(0, 255, (6, 7, channels), np.uint8)
     suffix, data = file_of(
-        "sensor_msgs/msg/Image", made.raw_image(1.0, pixels, encoding, "cam", pad=3), "here"
+        "sensor_msgs/msg/Image", messages.raw_image(1.0, pixels, encoding, "cam", pad=3), "here"
     )
     got = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     colour = pixels[..., :3] if channels > 1 else np.repeat(pixels, 3, axis=2)
@@ -53,8 +53,8 @@ def test_a_bayer_pattern_is_read_as_ros_names_it(pattern):
     """A plane of one colour: behind every filter its own channel's value."""
     value = {"r": 200, "g": 120, "b": 30}
     tile = np.array([value[letter] for letter in pattern], np.uint8).reshape(2, 2)
-    made = Messages().raw_image(1.0, np.tile(tile, (4, 4))[..., None], f"bayer_{pattern}8", "cam")
-    got = cv2.imdecode(np.frombuffer(file_of("sensor_msgs/msg/Image", made, "here")[1], np.uint8), 1)
+    image = Messages().raw_image(1.0, np.tile(tile, (4, 4))[..., None], f"bayer_{pattern}8", "cam")
+    got = cv2.imdecode(np.frombuffer(file_of("sensor_msgs/msg/Image", image, "here")[1], np.uint8), 1)
     np.testing.assert_array_equal(got, np.broadcast_to([30, 120, 200], got.shape))
 
 
@@ -129,21 +129,21 @@ def test_compressed_images_of_16_bits_or_of_depth_are_named():
 
 
 def test_messages_without_an_image_are_left_out_and_counted(folder, tmp_path, caplog):
-    made = messages_of(folder)
-    empty = next(row[2] for row in made.rows if row[1] == FRONT)
+    messages = messages_of(folder)
+    empty = next(row[2] for row in messages.rows if row[1] == FRONT)
     empty.data, empty.width, empty.height, empty.step = empty.data[:0], 0, 0, 0
-    got = read(tmp_path / "drive", topics_for(folder, write_ros2(tmp_path / "site", made)))
+    got = read(tmp_path / "drive", topics_for(folder, write_ros2(tmp_path / "site", messages)))
     assert front_times(got) == front_times(read_drive(folder))[1:]
     assert "left out 1 of 3 images, which are empty" in caplog.text
 
 
 def test_images_of_an_unknown_encoding_are_named(folder, tmp_path):
-    made = messages_of(folder)
-    for _, name, message in made.rows:
+    messages = messages_of(folder)
+    for _, name, message in messages.rows:
         if name == "/sensing/front/image_raw":
             message.encoding = "16UC1"
     with pytest.raises(DriveError, match="image 1: encoding '16UC1' is not known; record one of mono8"):
-        read(tmp_path / "drive", topics_for(folder, write_ros2(tmp_path / "site", made)))
+        read(tmp_path / "drive", topics_for(folder, write_ros2(tmp_path / "site", messages)))
 
 
 H265 = "lossless=1:bframes=0:keyint=2:min-keyint=2:repeat-headers=1:log-level=0"
@@ -179,16 +179,16 @@ def test_video_in_a_bag_is_decoded_from_its_first_key_frame_on(codec, kind, stat
             frame = frame.reformat(format=encoder.pix_fmt)
             frame.pts = number
         packets += [bytes(packet) for packet in encoder.encode(frame)]
-    made = messages_of(folder)
-    rows = [row for row in made.rows if row[1] == "/sensing/front/image_raw"]
-    made.rows = [row for row in made.rows if row[1] != "/sensing/front/image_raw"]
+    messages = messages_of(folder)
+    rows = [row for row in messages.rows if row[1] == "/sensing/front/image_raw"]
+    messages.rows = [row for row in messages.rows if row[1] != "/sensing/front/image_raw"]
     # The first packet of all is a key frame: leave it out, and the one after it has none.
     begin_s = rows[0][0] - 0.04
     for stamp_s, packet in zip([begin_s, *(row[0] for row in rows)], packets[1:], strict=True):
-        message = made.packet(kind, stamp_s, packet, stated, "front_optical")
-        made.add(stamp_s, "/sensing/front/image_raw", message)
-    made.rows.sort(key=lambda row: row[0])
-    bag = write_ros2(tmp_path / "site", made)
+        message = messages.packet(kind, stamp_s, packet, stated, "front_optical")
+        messages.add(stamp_s, "/sensing/front/image_raw", message)
+    messages.rows.sort(key=lambda row: row[0])
+    bag = write_ros2(tmp_path / "site", messages)
     with caplog.at_level(logging.WARNING):
         assert_same_drive(read(tmp_path / "drive", topics_for(folder, bag)), expected)
     assert "left out 1 of 4 packets of video: no key frame before them" in caplog.text

@@ -111,8 +111,8 @@ def test_a_bag_without_mounting_asks_for_it_and_becomes_a_drive(folder, tmp_path
     assert "\n" not in str(caught.value)
     first = ["check", "site", "--no-ground", "--write", "mysite"]
     assert run(first) == 2
-    asked = re.findall(r"--set (\S+)=", capsys.readouterr().err)
-    assert sorted(asked) == ["cameras.front.mounting", "cameras.rear.mounting"]
+    questions = re.findall(r"--set (\S+)=", capsys.readouterr().err)
+    assert sorted(questions) == ["cameras.front.mounting", "cameras.rear.mounting"]
     assert not Path("mysite").exists()
     (tmp_path / "lens.yaml").write_bytes((folder / "front" / "camera_info.yaml").read_bytes())
     said = {"cameras.front.camera_info": "lens.yaml"}
@@ -180,19 +180,19 @@ def test_another_recording_under_the_same_name_is_imported_anew(folder, tmp_path
     bag = write_ros1(tmp_path / "site", messages_of(folder, ros1=True))
     count = len(read(tmp_path / "drive", topics_for(folder, bag)).images)
     bag.unlink()
-    made = messages_of(folder, ros1=True)
-    last_s = max(row[0] for row in made.rows if "image" in row[1])
-    made.rows = [row for row in made.rows if row[0] < last_s or "image" not in row[1]]
-    write_ros1(tmp_path / "site", made)
+    messages = messages_of(folder, ros1=True)
+    last_s = max(row[0] for row in messages.rows if "image" in row[1])
+    messages.rows = [row for row in messages.rows if row[0] < last_s or "image" not in row[1]]
+    write_ros1(tmp_path / "site", messages)
     assert len(read(tmp_path / "drive", topics_for(folder, bag)).images) == count - 2
 
 
 def test_a_bag_in_parts_is_read_through(folder, tmp_path):
-    made = messages_of(folder)
+    messages = messages_of(folder)
     parts = tmp_path / "parts"
     parts.mkdir()
     for number in range(2):
-        half = Messages(rows=[row for row in made.rows if (row[0] > 101.0) == bool(number)])
+        half = Messages(rows=[row for row in messages.rows if (row[0] > 101.0) == bool(number)])
         (file,) = write_ros2(tmp_path / f"part_{number}", half).glob("*.mcap")
         file.rename(parts / f"wbag_{number}.mcap")
     assert_same_drive(read(tmp_path / "drive", topics_for(folder, parts)), read_drive(folder))
@@ -217,7 +217,7 @@ def test_a_bag_that_is_cut_off_is_one_line(kind, share, folder, tmp_path):
 def test_a_topic_that_is_not_there_or_of_another_type_is_named(folder, bags, tmp_path):
     for name, message in (
         ("/nowhere", r"no topic /nowhere; topics of type .*: /odom"),
-        ("/sensing/front/camera_info", r"is of type sensor_msgs/msg/CameraInfo, expected .*Odometry"),
+        ("/sensing/front/camera_info", r"has type sensor_msgs/msg/CameraInfo, expected .*Odometry"),
     ):
         with pytest.raises(DriveError, match=message):
             read(tmp_path / "drive", topics_for(folder, bags["mcap"], poses={"topic": name}))
@@ -245,12 +245,12 @@ def test_a_type_that_the_bag_does_not_define_is_named_only_if_it_is_wanted(folde
 
 def _restamped(folder, topic, stamp_of_number):
     """The messages of ``folder`` whose headers on ``topic`` have other times, s, by their numbers from 0."""
-    made = messages_of(folder)
-    headers = [row[2].header for row in made.rows if row[1] == topic]
+    messages = messages_of(folder)
+    headers = [row[2].header for row in messages.rows if row[1] == topic]
     for number, stamp_s in stamp_of_number.items():
         stamp = headers[number].stamp
         stamp.sec, stamp.nanosec = int(stamp_s), round(stamp_s % 1 * 1e9)
-    return made
+    return messages
 
 
 def test_images_on_two_clocks_are_named(folder, tmp_path):
@@ -265,20 +265,20 @@ def test_images_that_come_late_or_twice_or_have_no_time_are_sorted_or_dropped_an
     expected = read_drive(folder)
     times = front_times(expected)
     pixels = {(image.camera, image.stamp_s): cv2.imread(str(image.path)) for image in expected.images}
-    for name, made, kept in (
+    for name, messages, expected_times in (
         ("late", messages_of(folder), times),
         ("twice", messages_of(folder), times),
         ("zero", _restamped(folder, FRONT, {0: 0}), times[1:]),
     ):
-        places = [place for place, row in enumerate(made.rows) if row[1] == FRONT]
+        places = [place for place, row in enumerate(messages.rows) if row[1] == FRONT]
         if name == "late":
-            first, second = (made.rows[place] for place in places[:2])
-            made.rows[places[0]] = (first[0], FRONT, second[2])
-            made.rows[places[1]] = (second[0], FRONT, first[2])
+            first, second = (messages.rows[place] for place in places[:2])
+            messages.rows[places[0]] = (first[0], FRONT, second[2])
+            messages.rows[places[1]] = (second[0], FRONT, first[2])
         if name == "twice":
-            made.rows.insert(places[0], made.rows[places[0]])
-        got = read(tmp_path / name, topics_for(folder, write_ros2(tmp_path / f"bag_{name}", made)))
-        assert front_times(got) == kept
+            messages.rows.insert(places[0], messages.rows[places[0]])
+        got = read(tmp_path / name, topics_for(folder, write_ros2(tmp_path / f"bag_{name}", messages)))
+        assert front_times(got) == expected_times
         for image in got.images:
             np.testing.assert_array_equal(cv2.imread(str(image.path)), pixels[image.camera, image.stamp_s])
     for words in ("sorted images that were late: 1", "whose time repeats: 1", "without a time: 1"):
@@ -305,12 +305,12 @@ def test_memory_does_not_grow_with_the_bag(kind, folder, tmp_path):
     large = np.random.default_rng(1).integers(0, 255, (240, 320, 3), np.uint8)
     peaks = []
     for count in (10, 40):
-        made = Messages(ros1=kind == "ros1")
+        messages = Messages(ros1=kind == "ros1")
         for k in range(count):
-            made.add(1.0 + k, "/image", made.raw_image(1.0 + k, large, "bgr8", "cam"))
+            messages.add(1.0 + k, "/image", messages.raw_image(1.0 + k, large, "bgr8", "cam"))
         path, storage = tmp_path / f"site_{count}", MCAP if kind == "mcap" else SQLITE3
-        path = write_ros1(path, made) if made.ros1 else write_ros2(path, made, storage)
-        del made
+        path = write_ros1(path, messages) if messages.ros1 else write_ros2(path, messages, storage)
+        del messages
         (tmp_path / f"images_{count}").mkdir()
         tracemalloc.start()
         write_streams(path, {tmp_path / f"images_{count}": ImageStream("/image", "header", "here")})

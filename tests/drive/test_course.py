@@ -52,8 +52,8 @@ def antenna_of(drive, rng, lever_m=LEVER_M):
     drift = np.zeros((len(rows), 2))
     drift[0] = rng.normal(size=2)
     for row in range(1, len(rows)):
-        kept = np.exp(-max(way[row], 0.01) / 30)
-        drift[row] = kept * drift[row - 1] + np.sqrt(1 - kept**2) * rng.normal(size=2)
+        memory = np.exp(-max(way[row], 0.01) / 30)
+        drift[row] = memory * drift[row - 1] + np.sqrt(1 - memory**2) * rng.normal(size=2)
     noise = np.sqrt(0.5) * SIGMA_M * (drift + rng.normal(size=drift.shape))
     return rows, antenna + noise
 
@@ -169,8 +169,8 @@ def test_a_standing_vehicle_has_no_course():
 def test_a_turn_that_nobody_saw_is_asked_for():
     turned = driven((10, 4, 0), (12, 0.5, 0.26), (10, 4, 0))
     rows, antenna = antenna_of(turned, np.random.default_rng(0))
-    seen = (turned.stamp_s[rows] < 10) | (turned.stamp_s[rows] > 21)
-    rows, antenna = rows[seen], antenna[seen]
+    is_recorded = (turned.stamp_s[rows] < 10) | (turned.stamp_s[rows] > 21)
+    rows, antenna = rows[is_recorded], antenna[is_recorded]
     course = course_of(turned.stamp_s[rows], antenna, np.full(len(rows), SIGMA_M), LEVER_M, None, "log")
     with pytest.raises(
         DriveError, match=r"the course turns by .* where the vehicle stands or positions lack"

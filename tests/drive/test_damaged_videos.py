@@ -47,20 +47,20 @@ def test_a_flipped_bit_in_a_video_whose_pictures_carry_hashes_is_reported(tmp_pa
 
 
 def test_damage_that_the_decoder_of_a_topics_video_conceals_is_reported_once(tmp_path, caplog):
-    path, made = tmp_path / "a.mkv", Messages()
+    path, messages = tmp_path / "a.mkv", Messages()
     _video(path, codec="libx264", bf="0")
     with av.open(str(path)) as container:
         start = av.BitStreamFilterContext("h264_mp4toannexb", container.streams.video[0])
-        packets = [bytes(one) for packet in container.demux(video=0) for one in start.filter(packet)]
+        packets = [bytes(part) for packet in container.demux(video=0) for part in start.filter(packet)]
     for number, packet in enumerate(filter(None, packets)):
         damaged = bytearray(packet)
         if number > 5:
             damaged[len(packet) // 2 :] = bytes(len(packet) - len(packet) // 2)
-        stamp, data = made.header(1.0 + number, "cam").stamp, np.frombuffer(damaged, np.uint8)
+        stamp, data = messages.header(1.0 + number, "cam").stamp, np.frombuffer(damaged, np.uint8)
         fields = {"timestamp": stamp, "frame_id": "cam", "data": data, "format": "h264"}
-        made.add(1.0 + number, "/video", made.make(VIDEO, **fields))
+        messages.add(1.0 + number, "/video", messages.make(VIDEO, **fields))
     stream = ImageStream("/video", "header", "here")
-    import_streams(write_ros2(tmp_path / "bag", made), [stream], tmp_path / "cache")
+    import_streams(write_ros2(tmp_path / "bag", messages), [stream], tmp_path / "cache")
     assert re.search(r"/video: packet 7: decoder error", caplog.text)
     assert caplog.text.count("decoder error") == 1
 

@@ -17,9 +17,9 @@ def detections() -> ImageDetections:
     """A marking with independent corners, one with a full covariance of which a corner is hidden, a line."""
     corners = np.array([[100.25, 300.5], [95.0, 340.125], [135.0, 350.0], [140.0, 310.0]])
     root = np.random.default_rng(1).normal(size=(8, 8))
-    known = np.array([True, True, False, True])
+    is_known = np.array([True, True, False, True])
     plain = MarkingDetection("diamond", 0.9, corners, np.diag(np.arange(1.0, 9.0)), np.ones(4, dtype=bool))
-    full = MarkingDetection("lane_dash", 0.7, corners + 50.0, root @ root.T + np.eye(8), known)
+    full = MarkingDetection("lane_dash", 0.7, corners + 50.0, root @ root.T + np.eye(8), is_known)
     line = LaneDetection("lane_line", 0.8, corners, 2, np.array([0.5, 0.6, 0.7, 0.8]))
     return ImageDetections(7, (plain, full), (line,))
 
@@ -75,10 +75,10 @@ def test_corners_that_a_tool_lists_clockwise_run_the_other_way_with_all_that_is_
 
 def test_a_far_marking_that_noise_turns_over_turns_no_other(tmp_path):
     """A dash of 20 x 1 px whose corners are known to 0.5 px, beside a diamond of 40 px."""
-    near = detections().markings[0]
+    near_marking = detections().markings[0]
     corners = np.array([[200.0, 100.0], [220.0, 100.0], [220.0, 101.0], [200.0, 101.0]])
-    far = replace(near, corners_px=corners, covariance_px=0.25 * np.eye(8))
-    for markings in ((near, far), (far,)):
+    far = replace(near_marking, corners_px=corners, covariance_px=0.25 * np.eye(8))
+    for markings in ((near_marking, far), (far,)):
         write_detections(tmp_path / "a.json", ImageDetections(0, markings, ()))
         read = read_detections(tmp_path / "a.json", 0).markings
         np.testing.assert_allclose(read[-1].corners_px, corners)
@@ -105,9 +105,9 @@ def line(**changes: object) -> dict[str, object]:
         ({"markings": [marking(corners_px=[[0, 0]] * 3)]}, "expected 4 x 2 numbers"),
         ({"markings": [marking(known=[1, 1, 1, 1])]}, "true or false"),
         ({"markings": [marking(colour="white")]}, "unknown key 'colour'"),
-        ({"markings": [marking(score=95)]}, "95 is no probability"),
+        ({"markings": [marking(score=95)]}, "95 is not a probability"),
         ({"markings": [], "lanes": [line(sigma_px=[1.0, -1.0])]}, "is not above 0"),
-        ({"markings": [], "lanes": [line(score=-1)]}, "-1 is no probability"),
+        ({"markings": [], "lanes": [line(score=-1)]}, "-1 is not a probability"),
     ],
 )
 def test_a_damaged_file_is_one_line_that_names_it(tmp_path, content, says):

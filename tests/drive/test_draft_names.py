@@ -47,9 +47,9 @@ def test_a_link_to_a_file_that_is_gone_is_not_replaced(tmp_path):
 
 
 def test_settings_of_another_camera_are_named(tmp_path):
-    given = ["cameras.fornt.camera_info=a.yaml", "poses=p.tum"]
+    settings = ["cameras.fornt.camera_info=a.yaml", "poses=p.tum"]
     with pytest.raises(DriveError, match=r"--set cameras\.fornt\.camera_info: not used, .* name front"):
-        draft_drive(images(tmp_path / "front", "1.0"), tmp_path / "drive", given)
+        draft_drive(images(tmp_path / "front", "1.0"), tmp_path / "drive", settings)
 
 
 def test_a_folder_name_moves_no_cursor(tmp_path, capsys):

@@ -171,7 +171,7 @@ def test_a_mask_of_the_vehicle_is_read_and_one_of_another_size_refused(tmp_path)
     assert camera.own_vehicle is not None
     np.testing.assert_array_equal(camera.own_vehicle, mask > 0)
     cv2.imwrite(str(tmp_path / "front" / "bonnet.png"), mask[:20])
-    with pytest.raises(DriveError, match=r"mask: .*bonnet\.png is no image of 64 x 48 px"):
+    with pytest.raises(DriveError, match=r"mask: .*bonnet\.png is not an image of 64 x 48 px"):
         read_drive(tmp_path)
 
 
@@ -257,10 +257,10 @@ def test_poses_without_numbers_and_of_equal_times_are_left_out_and_counted(tmp_p
     path = tmp_path / "poses.tum"
     path.write_text("\n".join(lines))
     got = read_tum(path)
-    kept = np.delete(np.array(POSES), (3, 7), axis=0)
-    np.testing.assert_allclose(got.stamp_s, kept[:, 0], atol=1e-6)
-    np.testing.assert_allclose(got.map_from_vehicle[:, 0, 3], kept[:, 1])
-    assert "left out 1 of 21 poses that are no numbers" in caplog.text
+    rows = np.delete(np.array(POSES), (3, 7), axis=0)
+    np.testing.assert_allclose(got.stamp_s, rows[:, 0], atol=1e-6)
+    np.testing.assert_allclose(got.map_from_vehicle[:, 0, 3], rows[:, 1])
+    assert "left out 1 of 21 poses that are not numbers" in caplog.text
     assert "left out 1 of 20 poses of equal or stray times" in caplog.text
     assert "sorted its poses by time: 1 came late" in caplog.text
 
@@ -300,13 +300,13 @@ def test_a_progressive_jpeg_with_a_comment_has_a_size_too(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-@given(kept=st.floats(0.0, 0.999))
-def test_every_truncation_is_noticed(tmp_path_factory, suffix, kept):
+@given(share=st.floats(0.0, 0.999))
+def test_every_truncation_is_noticed(tmp_path_factory, suffix, share):
     path = tmp_path_factory.mktemp("image") / f"image{suffix}"
     noise = np.random.default_rng(1).integers(0, 255, (60, 80, 3), dtype=np.uint8)
     assert cv2.imwrite(str(path), noise)
     content = path.read_bytes()
-    path.write_bytes(content[: max(8, int(kept * (len(content) - 12)))])
+    path.write_bytes(content[: max(8, int(share * (len(content) - 12)))])
     with pytest.raises(DriveError, match="truncated"):
         read_header(path)
 

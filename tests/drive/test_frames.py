@@ -70,9 +70,9 @@ def matrix_of(transform: Mapping[str, Mapping[str, float]]) -> FloatArray:
 def applied(tree: Tree, path: Path) -> Tree:
     """The tree with the edge of a static_transform.yaml or an origin.urdf."""
     if path.suffix == ".yaml":
-        (one,) = yaml.safe_load(path.read_text())["transforms"]
-        ends = one["header"]["frame_id"], one["child_frame_id"]
-        return with_edge(tree, *ends, matrix_of(one["transform"]))
+        (transform,) = yaml.safe_load(path.read_text())["transforms"]
+        ends = transform["header"]["frame_id"], transform["child_frame_id"]
+        return with_edge(tree, *ends, matrix_of(transform["transform"]))
     root = ET.parse(path).getroot()
     parent, child = (root.find(f"joint/{end}").get("link") for end in ("parent", "child"))  # type: ignore[union-attr]
     origin = root.find("joint/origin")
@@ -83,17 +83,17 @@ def applied(tree: Tree, path: Path) -> Tree:
 
 def recorded(folder: Path, tree: Tree, prefix: str, child: str = "base_link", ros1: bool = False) -> Messages:
     """The drive in ``folder`` with the frames of ``tree``, as messages."""
-    made = messages_of(folder, ros1=ros1, fixed_frames=False)
-    for _, topic, message in made.rows:
+    messages = messages_of(folder, ros1=ros1, fixed_frames=False)
+    for _, topic, message in messages.rows:
         if topic.startswith("/sensing"):
             message.header.frame_id = f"{prefix}{topic.split('/')[2]}_optical"
         else:
             message.header.frame_id = f"{prefix}odom"
             message.child_frame_id = f"{prefix}{child}"
     if tree:
-        made.add(made.rows[0][0], "/tf_static", made.transforms(made.rows[0][0], tree))
-    made.rows.sort(key=lambda row: row[0])
-    return made
+        messages.add(messages.rows[0][0], "/tf_static", messages.transforms(messages.rows[0][0], tree))
+    messages.rows.sort(key=lambda row: row[0])
+    return messages
 
 
 def read(path, **options):
@@ -113,8 +113,8 @@ def test_a_calibration_applied_to_its_own_tree_is_the_calibration(
 ):
     """Without base_footprint the height of base_link is what the user states."""
     tree = tree_of(prefix, footprint)
-    made = recorded(folder, tree, prefix, ros1=ros1)
-    bag = write_ros1(tmp_path / "site", made) if ros1 else write_ros2(tmp_path / "site", made)
+    messages = recorded(folder, tree, prefix, ros1=ros1)
+    bag = write_ros1(tmp_path / "site", messages) if ros1 else write_ros2(tmp_path / "site", messages)
     drive = read(bag)
     if not footprint:
         stated = f"vehicle_frame_height_m={AXLE_M}"
@@ -145,9 +145,9 @@ def test_any_edge_on_the_way_may_be_replaced_instead(folder, tmp_path):
     path = write_calibration_as("static_transform", calibrated(camera, truth), Provenance(), tmp_path, "rear")
     lines = [line[2:] for line in path.read_text().splitlines() if line.startswith("# ")]
     others = yaml.safe_load("\n".join(lines))["instead"]
-    assert [one["child_frame_id"].split("/")[1] for one in others] == ["base_link", "roof_bar", "rear_link"]
-    for one in others:
-        changed = with_edge(tree, one["frame_id"], one["child_frame_id"], matrix_of(one))
+    assert [edge["child_frame_id"].split("/")[1] for edge in others] == ["base_link", "roof_bar", "rear_link"]
+    for edge in others:
+        changed = with_edge(tree, edge["frame_id"], edge["child_frame_id"], matrix_of(edge))
         got = composed(changed, "tractor_07/base_footprint", "tractor_07/rear_optical")
         np.testing.assert_allclose(got, inverse(truth), atol=1e-9)
 
@@ -158,8 +158,10 @@ def test_a_calibration_file_keeps_its_frames_for_a_later_export(folder, tmp_path
     camera = read(bag).cameras["front"]
     frames = replace(camera.frames, height_m=AXLE_M)
     file = tmp_path / "calibration_front.yaml"
-    one = Calibration(camera.info, TURNED @ initial_extrinsic(camera) @ at(0, 0, -AXLE_M), frames=frames)
-    write_calibration(one, file)
+    calibration = Calibration(
+        camera.info, TURNED @ initial_extrinsic(camera) @ at(0, 0, -AXLE_M), frames=frames
+    )
+    write_calibration(calibration, file)
     again = read_calibration(file).frames
     assert (again.vehicle, again.camera, again.height_m) == ("base_link", "front_optical", AXLE_M)
     for step, expected in zip(again.steps, frames.steps, strict=True):
@@ -168,7 +170,7 @@ def test_a_calibration_file_keeps_its_frames_for_a_later_export(folder, tmp_path
     assert run(["export", str(file), "--format", "static_transform", "--format", "urdf"]) == 0
     for name in ("front_static_transform.yaml", "front_origin.urdf"):
         got = composed(applied(tree, tmp_path / name), "base_link", "front_optical")
-        np.testing.assert_allclose(at(0, 0, AXLE_M) @ got, inverse(one.cam_from_vehicle), atol=1e-9)
+        np.testing.assert_allclose(at(0, 0, AXLE_M) @ got, inverse(calibration.cam_from_vehicle), atol=1e-9)
 
 
 def test_frames_that_nobody_stated_are_in_no_file(tmp_path, folder, capsys):
@@ -202,8 +204,8 @@ def test_a_folder_drive_names_its_frames(folder, tmp_path):
     np.testing.assert_allclose(camera_centre(initial_extrinsic(camera)), [1.0, 0.0, 1.8], atol=1e-6)
     assert camera.centre_prior is not None
     np.testing.assert_allclose(camera.centre_prior.centre_vehicle, [0.0, 0.0, 2.3])
-    one = calibrated(camera, initial_extrinsic(camera))
-    path = write_calibration_as("static_transform", one, Provenance(), tmp_path, "front")
+    calibration = calibrated(camera, initial_extrinsic(camera))
+    path = write_calibration_as("static_transform", calibration, Provenance(), tmp_path, "front")
     got = applied({}, path)["rover/base_link", "rover/front_optical"]
     np.testing.assert_allclose(got[:3, 3], [1.0, 0.0, 1.5], atol=1e-6)
 
@@ -240,20 +242,20 @@ PLACE = at(1.0, 0.0, 1.5, -90, 0, -90) @ at(0, 0, 0, -15, 0, 0)
 
 def framed(folder, tmp_path, static, moving=(), child="base_link", frame="front_optical"):
     """The mounting of the camera front that a bag of one camera has, or what is asked for."""
-    made = messages_of(folder, fixed_frames=False)
-    made.rows = [row for row in made.rows if not row[1].startswith("/sensing/rear")]
-    for _, topic, message in made.rows:
+    messages = messages_of(folder, fixed_frames=False)
+    messages.rows = [row for row in messages.rows if not row[1].startswith("/sensing/rear")]
+    for _, topic, message in messages.rows:
         if topic.startswith("/sensing"):
             message.header.frame_id = frame
         else:
             message.child_frame_id = child
-    first = made.rows[0][0]
+    first = messages.rows[0][0]
     for late_s, edges in static:
-        made.add(first + late_s, "/tf_static", made.transforms(first + late_s, edges))
+        messages.add(first + late_s, "/tf_static", messages.transforms(first + late_s, edges))
     for late_s, edges in moving:
-        made.add(first + late_s, "/tf", made.transforms(first + late_s, edges))
-    made.rows.sort(key=lambda row: row[0])
-    bag = write_ros2(tmp_path / "site", made)
+        messages.add(first + late_s, "/tf", messages.transforms(first + late_s, edges))
+    messages.rows.sort(key=lambda row: row[0])
+    bag = write_ros2(tmp_path / "site", messages)
     try:
         drive = read(bag)
     except DriveError as refusal:
@@ -333,10 +335,10 @@ def test_a_tree_that_does_not_tell_the_mounting_says_why(name, folder, tmp_path,
     assert isinstance(refusal, str)
     assert re.search(key, refusal)
     assert run(["check", str(tmp_path / "site"), "--no-ground", "--write", str(tmp_path / "d")]) == 2
-    asked = capsys.readouterr().err
-    assert asked.count("--set") == 1 + len(more_keys)
-    assert all(f"--set {more}=" in asked for more in more_keys)
-    assert why in asked
+    message = capsys.readouterr().err
+    assert message.count("--set") == 1 + len(more_keys)
+    assert all(f"--set {more}=" in message for more in more_keys)
+    assert why in message
 
 
 def test_the_vehicle_s_frame_that_is_named_leads_to_mountings_and_poses(folder, tmp_path, capsys):
@@ -404,14 +406,14 @@ def test_poses_are_of_the_frame_that_they_name(child, offset, folder, tmp_path):
 def test_poses_that_name_no_frame_are_asked_about_in_words(folder, tmp_path, capsys):
     assert "poses.lever_arm_m" in framed(folder, tmp_path, [(0.0, {LINK: PLACE})], child="")
     assert run(["check", str(tmp_path / "site"), "--no-ground", "--write", str(tmp_path / "d")]) == 2
-    asked = capsys.readouterr().err
-    assert "/odom does not say of which frame its poses are" in asked
-    assert "from base_link: [0, 0, 0] if it is that frame itself" in asked
+    message = capsys.readouterr().err
+    assert "/odom does not say of which frame its poses are" in message
+    assert "from base_link: [0, 0, 0] if it is that frame itself" in message
 
 
 def test_names_of_a_chain_touch(folder, tmp_path):
     drive = read(write_ros2(tmp_path / "site", recorded(folder, tree_of(), "tractor_07/")))
     frames = drive.cameras["front"].frames
-    for near, far in pairwise(frames.steps):
-        assert near.child == far.parent
+    for nearer, far in pairwise(frames.steps):
+        assert nearer.child == far.parent
     assert (frames.steps[0].parent, frames.steps[-1].child) == (frames.vehicle, frames.camera)

@@ -77,7 +77,7 @@ def test_a_database_that_computes_its_rows_is_refused(mode, sql, folder, tmp_pat
         database.executescript(sql)
     data = plain.read_bytes()
     file.write_bytes(zstd.compress(data) if mode == CompressionMode.FILE else data)
-    with pytest.raises(DriveError, match="is no plain table of a recording"):
+    with pytest.raises(DriveError, match="is not a plain table of a recording"):
         read(tmp_path / "drive", topics_for(folder, bag))
 
 
@@ -160,34 +160,34 @@ def test_a_chunk_that_the_index_lists_many_times_is_refused(folder, tmp_path):
 
 
 PACKED: dict[str, Callable[[Path, Messages], Path]] = {
-    "ros1 lz4": lambda path, made: write_ros1(path, made, "lz4"),
-    "ros1 bz2": lambda path, made: write_ros1(path, made, "bz2"),
-    "mcap zstd chunks": lambda path, made: write_ros2(path, made, MCAP, CompressionMode.STORAGE),
+    "ros1 lz4": lambda path, messages: write_ros1(path, messages, "lz4"),
+    "ros1 bz2": lambda path, messages: write_ros1(path, messages, "bz2"),
+    "mcap zstd chunks": lambda path, messages: write_ros2(path, messages, MCAP, CompressionMode.STORAGE),
 }
 
 
 @pytest.mark.parametrize("kind", PACKED)
 def test_chunks_of_zeros_are_refused_together_though_none_is_alone(kind, tmp_path, monkeypatch):
     monkeypatch.setattr(reading, "_SPARE_BYTES", 4_000_000)
-    made = Messages(kind.startswith("ros1"))
+    messages = Messages(kind.startswith("ros1"))
     for number in range(10):
-        zeros = made.raw_image(1.0 + number, np.zeros((600, 1000, 3), np.uint8), "rgb8", "front")
-        made.add(1.0 + number, "/image", zeros)
-    bag = PACKED[kind](tmp_path / "bag", made)
+        zeros = messages.raw_image(1.0 + number, np.zeros((600, 1000, 3), np.uint8), "rgb8", "front")
+        messages.add(1.0 + number, "/image", zeros)
+    bag = PACKED[kind](tmp_path / "bag", messages)
     images = {tmp_path: ImageStream("/image", "header", "here")}
     with pytest.raises(DriveError, match="unpacks to more than a recording could"):
         write_streams(bag, images)
-    made.rows = made.rows[:1]
-    write_streams(PACKED[kind](tmp_path / "one", made), images)
+    messages.rows = messages.rows[:1]
+    write_streams(PACKED[kind](tmp_path / "one", messages), images)
 
 
 @pytest.mark.parametrize("kind", PACKED)
 def test_a_message_of_zeros_is_refused(kind, tmp_path, monkeypatch):
     monkeypatch.setattr(reading, "_SPARE_BYTES", 1_000_000)
-    made = Messages(kind.startswith("ros1"))
+    messages = Messages(kind.startswith("ros1"))
     zeros = np.zeros((2000, 4000, 3), dtype=np.uint8)
-    made.add(1.0, "/image", made.raw_image(1.0, zeros, "rgb8", "front"))
-    bag = PACKED[kind](tmp_path / "bag", made)
+    messages.add(1.0, "/image", messages.raw_image(1.0, zeros, "rgb8", "front"))
+    bag = PACKED[kind](tmp_path / "bag", messages)
     (file,) = [bag] if bag.is_file() else bag.glob("*.mcap")
     assert file.stat().st_size < 200_000
     with pytest.raises(DriveError, match="unpacks to more than a recording could") as refused:
@@ -199,10 +199,10 @@ def test_a_message_of_zeros_is_refused(kind, tmp_path, monkeypatch):
 def test_zeros_that_do_not_fit_in_the_childs_memory_are_refused(kind, tmp_path, monkeypatch):
     """Wherever rosbags unpacks them, and by whatever."""
     monkeypatch.setattr(child, "_SPARE_BYTES", 300_000_000)
-    made = Messages(kind.startswith("ros1"))
+    messages = Messages(kind.startswith("ros1"))
     zeros = np.zeros((10_000, 10_000, 3), dtype=np.uint8)
-    made.add(1.0, "/image", made.raw_image(1.0, zeros, "rgb8", "front"))
-    bag = PACKED[kind](tmp_path / "bag", made)
+    messages.add(1.0, "/image", messages.raw_image(1.0, zeros, "rgb8", "front"))
+    bag = PACKED[kind](tmp_path / "bag", messages)
     with pytest.raises(DriveError, match="unpacks to more than a recording could") as refused:
         import_streams(bag, [ImageStream("/image", "header", "here")], tmp_path / "cache")
     assert "\n" not in str(refused.value)
@@ -210,8 +210,8 @@ def test_zeros_that_do_not_fit_in_the_childs_memory_are_refused(kind, tmp_path, 
 
 
 def test_a_frame_whose_name_has_a_tab_is_refused(folder, tmp_path):
-    made = messages_of(folder, mounted={**mountings(), "a\tb": mountings()["front"]})
-    bag = write_ros2(tmp_path / "bag", made)
+    messages = messages_of(folder, mounted={**mountings(), "a\tb": mountings()["front"]})
+    bag = write_ros2(tmp_path / "bag", messages)
     with pytest.raises(DriveError, match="a frame is named") as refused:
         import_streams(bag, [TfStream("here")], tmp_path / "cache")
     assert "\t" not in str(refused.value)

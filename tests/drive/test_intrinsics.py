@@ -386,15 +386,15 @@ def drive_with(folder, described):
 
 
 def test_a_drive_takes_intrinsics_of_any_format_by_file_and_camera(tmp_path):
-    own = camera_info("front")
-    (fx, _, cx), (_, fy, cy), _ = own.intrinsic.tolist()
-    lens = {"distortion_model": "radtan", "distortion_coeffs": list(own.distortion[:4])}
-    size = {"camera_model": "pinhole", "resolution": [own.width, own.height]}
+    pinhole = camera_info("front")
+    (fx, _, cx), (_, fy, cy), _ = pinhole.intrinsic.tolist()
+    lens = {"distortion_model": "radtan", "distortion_coeffs": list(pinhole.distortion[:4])}
+    size = {"camera_model": "pinhole", "resolution": [pinhole.width, pinhole.height]}
     chain = {f"cam{n}": {**size, **lens, "intrinsics": [fx + n, fy, cx, cy]} for n in range(2)}
     drive_with(tmp_path, {"file": "chain.yaml", "camera": "cam1"})
     (tmp_path / "chain.yaml").write_text(yaml.safe_dump(chain))
     info = read_drive(tmp_path).cameras["front"].info
-    assert (info.name, info.intrinsic[0, 0], info.distortion) == ("front", fx + 1, own.distortion)
+    assert (info.name, info.intrinsic[0, 0], info.distortion) == ("front", fx + 1, pinhole.distortion)
 
 
 def test_a_drive_asks_which_camera_of_a_chain_and_names_the_key(tmp_path):

@@ -23,33 +23,33 @@ def _record(code: int, content: bytes) -> bytes:
 
 def write_mcap(
     path: Path,
-    made: Messages,
+    messages: Messages,
     profile: str,
     library: str = "",
     encoding: str | None = None,
-    own: bool = False,
+    has_own_schemas: bool = False,
 ) -> Path:
     """A file without chunks or an index, as https://mcap.dev/spec has it; ``own`` adds a channel of JSON."""
-    store: Any = ROS1 if made.ros1 else ROS2
-    serialize = store.serialize_ros1 if made.ros1 else store.serialize_cdr
-    language = "ros1msg" if made.ros1 else "ros2msg"
+    store: Any = ROS1 if messages.ros1 else ROS2
+    serialize = store.serialize_ros1 if messages.ros1 else store.serialize_cdr
+    language = "ros1msg" if messages.ros1 else "ros2msg"
     records = [_record(1, _text(profile) + _text(library))]
     channels: dict[str, int] = {}
-    if own:
+    if has_own_schemas:
         records.append(_record(3, struct.pack("<H", 99) + _text("Own") + _text("jsonschema") + _text("{}")))
         records.append(_record(4, struct.pack("<HH", 99, 99) + _text("/own") + _text("json") + _text("")))
         records.append(_record(5, struct.pack("<HIQQ", 99, 0, 1, 1) + b"{}"))
-    for number, (stamp_s, topic, message) in enumerate(made.rows):
+    for number, (stamp_s, topic, message) in enumerate(messages.rows):
         kind = message.__msgtype__
         if topic not in channels:
             key = len(channels) + 1
             channels[topic] = key
-            definition, _ = store.generate_msgdef(kind, ros_version=1 if made.ros1 else 2)
-            name = kind.replace("/msg/", "/") if made.ros1 else kind
+            definition, _ = store.generate_msgdef(kind, ros_version=1 if messages.ros1 else 2)
+            name = kind.replace("/msg/", "/") if messages.ros1 else kind
             records.append(
                 _record(3, struct.pack("<H", key) + _text(name) + _text(language) + _text(definition))
             )
-            wire = encoding or ("ros1" if made.ros1 else "cdr")
+            wire = encoding or ("ros1" if messages.ros1 else "cdr")
             records.append(_record(4, struct.pack("<HH", key, key) + _text(topic) + _text(wire) + _text("")))
         head = struct.pack("<HIQQ", channels[topic], number, round(stamp_s * 1e9), round(stamp_s * 1e9))
         records.append(_record(5, head + bytes(serialize(message, kind))))
@@ -68,7 +68,7 @@ def test_a_file_of_any_profile_is_the_same_drive(ros1, profile, library, folder,
 
 
 def test_channels_of_another_kind_beside_those_of_ros_do_not_matter(folder, tmp_path):
-    bag = write_mcap(tmp_path / "site.mcap", messages_of(folder), "", own=True)
+    bag = write_mcap(tmp_path / "site.mcap", messages_of(folder), "", has_own_schemas=True)
     assert_same_drive(read(tmp_path / "drive", topics_for(folder, bag)), read_drive(folder))
 
 

@@ -193,11 +193,11 @@ def test_two_receivers_in_one_log_are_told_apart(tmp_path, caplog):
 
     with pytest.raises(DriveError, match=r"two receivers, GN and GP, 1\.\d m apart: add talker: GN or GP"):
         read(both(4), tmp_path)
-    one = read(both(4), tmp_path, talker="GN").trajectory.map_from_vehicle
+    poses = read(both(4), tmp_path, talker="GN").trajectory.map_from_vehicle
     other = read(both(4), tmp_path, talker="GP").trajectory.map_from_vehicle
-    np.testing.assert_allclose((other - one)[:, 0, 3], 1.327, atol=0.01)
-    taken = read(both(1), tmp_path).trajectory.map_from_vehicle
-    np.testing.assert_allclose(taken, one)
+    np.testing.assert_allclose((other - poses)[:, 0, 3], 1.327, atol=0.01)
+    chosen = read(both(1), tmp_path).trajectory.map_from_vehicle
+    np.testing.assert_allclose(chosen, poses)
     assert "taking GN, which alone has RTK fixes" in caplog.text
     with pytest.raises(DriveError, match="no positions of talker 'GL'; it has: GN, GP"):
         read(both(4), tmp_path, talker="GL")

@@ -62,9 +62,9 @@ def test_the_optical_frame_that_hangs_on_the_named_one_is_meant():
         ("left_frame", "left_optical"): OPTICAL, ("camera_link", "depth_optical"): OPTICAL,
     })  # fmt: skip
     assert mount_of(frames, BASE, ["camera_link"], "left").frame == "left_optical"
-    asked = mount_of(frames, BASE, ["camera_link"], "front")
-    assert asked.vehicle_from_cam is None
-    assert "several hang on it: left_optical, depth_optical" in asked.problem.replace(
+    answer = mount_of(frames, BASE, ["camera_link"], "front")
+    assert answer.vehicle_from_cam is None
+    assert "several hang on it: left_optical, depth_optical" in answer.problem.replace(
         "depth_optical, left_optical", "left_optical, depth_optical"
     )
 
@@ -75,7 +75,7 @@ def test_a_frame_that_is_not_optical_is_named_with_the_mounting_that_its_turn_gi
     )
     assert (mount.frame, mount.vehicle_from_cam) == ("", None)
     assert (
-        "camera_link is no optical frame: its z axis, along which a camera looks, points 73 deg up"
+        "camera_link is not an optical frame: its z axis, along which a camera looks, points 73 deg up"
         in mount.problem
     )
     offer = yaml.safe_load(mount.offer.strip("'"))
@@ -97,18 +97,18 @@ def test_an_info_s_frame_counts_where_the_images_name_none_that_is_known():
 
 
 def front_alone(folder, edges, frame="camera_link", infos=True):
-    made = messages_of(folder, fixed_frames=False)
-    made.rows = [
+    messages = messages_of(folder, fixed_frames=False)
+    messages.rows = [
         row
-        for row in made.rows
+        for row in messages.rows
         if not row[1].startswith("/sensing/rear") and (infos or not row[1].endswith("camera_info"))
     ]
-    for _, topic, message in made.rows:
+    for _, topic, message in messages.rows:
         if topic.startswith("/sensing"):
             message.header.frame_id = frame
-    first_s = made.rows[0][0]
-    made.add(first_s, "/tf_static", made.transforms(first_s, edges))
-    return made
+    first_s = messages.rows[0][0]
+    messages.add(first_s, "/tf_static", messages.transforms(first_s, edges))
+    return messages
 
 
 BODY = at(1.0, 0.0, 1.5, 0, 15, 0)
@@ -119,7 +119,7 @@ def test_a_bag_whose_images_name_the_body_s_frame_is_one_answer_away_from_a_driv
     check = ["check", str(bag), "--no-ground", "--output", "out", "--write", "d"]
     assert run(check) == 2
     error = capsys.readouterr().err
-    assert "camera_link is no optical frame" in error
+    assert "camera_link is not an optical frame" in error
     assert "roi_vehicle" not in error
     (answer,) = re.findall(r"along its x axis: '(\{.*\})'", error)
     assert run([*check, "--set", f"cameras.front.mounting={answer}"]) in (0, 3)

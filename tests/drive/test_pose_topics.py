@@ -14,8 +14,8 @@ QUATERNION = "geometry_msgs/msg/QuaternionStamped"
 
 def pose(name, kind=ODOMETRY, parent="", frame="base_link", **more):
     stamps = [100.0 + 0.1 * k for k in range(50)]
-    known = {"moved_m": 40.0, "has_heading": True, "is_turned": True, "messages": 600} | more
-    return PoseSample(name=name, kind=kind, frame=frame, parent=parent, stamp_s=stamps, **known)
+    fields = {"moved_m": 40.0, "has_heading": True, "is_turned": True, "messages": 600} | more
+    return PoseSample(name=name, kind=kind, frame=frame, parent=parent, stamp_s=stamps, **fields)
 
 
 def fix(name, sigma_m=0.02, **more):

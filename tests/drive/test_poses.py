@@ -56,8 +56,10 @@ def place(points_map, origin=ORIGIN):
 def true_azimuth_deg(points_map, yaw):
     """Compass headings at the places themselves, from two points a metre apart on the ellipsoid."""
     ahead = points_map + np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))])
-    here, there = place(points_map), place(ahead)
-    azimuth, _, _ = pyproj.Geod(ellps="WGS84").inv(here[:, 1], here[:, 0], there[:, 1], there[:, 0])
+    here, place_ahead = place(points_map), place(ahead)
+    azimuth, _, _ = pyproj.Geod(ellps="WGS84").inv(
+        here[:, 1], here[:, 0], place_ahead[:, 1], place_ahead[:, 0]
+    )
     return np.asarray(azimuth) % 360
 
 
@@ -324,8 +326,8 @@ def test_lines_of_no_numbers_in_a_table_are_left_out_and_counted(tmp_path, caplo
     lines[9] = ",0.9,0,0,1"
     (tmp_path / "route.csv").write_text("\n".join(["stamp_s,x_m,y_m,z_m,yaw_deg", *lines]))
     got = read({"csv": "route.csv"}, tmp_path)
-    kept = np.delete(np.arange(20) / 10, [3, 5, 9])
-    np.testing.assert_allclose(got.trajectory.map_from_vehicle[:, 0, 3], kept, atol=1e-12)
+    positions_m = np.delete(np.arange(20) / 10, [3, 5, 9])
+    np.testing.assert_allclose(got.trajectory.map_from_vehicle[:, 0, 3], positions_m, atol=1e-12)
     for words in ("1 of 20 lines without a time", "2 of 19 positions", "1 of 19 headings"):
         assert words in caplog.text
 
@@ -348,28 +350,28 @@ def test_positions_that_do_not_say_how_sure_they_are_are_left_out_among_those_th
     assert "left out 2 of 20 positions" in caplog.text
 
 
-def with_topic(root, made, poses, **changes):
+def with_topic(root, messages, poses, **changes):
     """A drive of a folder's images at times within the curve, with the poses of a bag."""
     make_drive(root, stamps=(START_S + 1.0, START_S + 2.0, START_S + 9.0))
     with description(root) as content:
         content.pop("pose_noise")
         content |= {"bag": "site", "poses": poses} | changes
-    write_ros2(root / "site", made)
+    write_ros2(root / "site", messages)
     return read_drive(root, ReadOptions(cache=str(root / "cache")))
 
 
 def test_fixes_and_an_imu_at_other_times_with_antenna_and_turned_sensor(tmp_path):
     stamp_s, points, yaw = curve()
-    made = Messages()
+    messages = Messages()
     for k, where in enumerate(place(antenna(points, yaw))):
         status = -1 if k in (3, 4) else 2
-        made.add(stamp_s[k], "/fix", made.fix(stamp_s[k], where, status, 0.015, "gnss"))
+        messages.add(stamp_s[k], "/fix", messages.fix(stamp_s[k], where, status, 0.015, "gnss"))
     # The Imu's x axis points left, and its clock ticks between the fixes.
     for t in np.arange(START_S - 0.01, START_S + 10.1, 0.02):
         turn = 0.4 + 5.0 * (t - START_S) / 30.0 + np.pi / 2
-        made.add(t, "/imu", made.imu(t, Rotation.from_euler("z", turn).as_matrix(), "imu"))
+        messages.add(t, "/imu", messages.imu(t, Rotation.from_euler("z", turn).as_matrix(), "imu"))
     poses = {"topic": "/fix", "heading_topic": "/imu", "lever_arm_m": list(LEVER_M)}
-    drive = with_topic(tmp_path, made, poses | {"mounting_rpy_deg": [0, 0, 90]})
+    drive = with_topic(tmp_path, messages, poses | {"mounting_rpy_deg": [0, 0, 90]})
     keep = np.delete(np.arange(41), (3, 4))
     np.testing.assert_allclose(drive.recorded.stamp_s, stamp_s[keep], atol=1e-6)
     got = drive.recorded.map_from_vehicle
@@ -384,32 +386,32 @@ def test_fixes_and_an_imu_at_other_times_with_antenna_and_turned_sensor(tmp_path
 
 def test_fixes_of_one_antenna_and_the_rates_of_an_upturned_imu_are_the_drive(tmp_path):
     stamp_s, points, yaw = curve()
-    made = Messages()
+    messages = Messages()
     for k, where in enumerate(place(antenna(points, yaw))):
-        made.add(stamp_s[k], "/fix", made.fix(stamp_s[k], where, 2, 0.015, "gnss"))
+        messages.add(stamp_s[k], "/fix", messages.fix(stamp_s[k], where, 2, 0.015, "gnss"))
     for t in np.arange(START_S - 0.01, START_S + 10.1, 0.02):
-        imu = made.imu(t, np.eye(3), "imu")
+        imu = messages.imu(t, np.eye(3), "imu")
         imu.angular_velocity.z = -5.0 / 30.0
-        made.add(t, "/imu", imu)
+        messages.add(t, "/imu", imu)
     poses = {"topic": "/fix", "heading": "course", "gyro_topic": "/imu", "lever_arm_m": list(LEVER_M)}
-    drive = with_topic(tmp_path, made, poses | {"mounting_rpy_deg": [180, 0, 0]})
+    drive = with_topic(tmp_path, messages, poses | {"mounting_rpy_deg": [180, 0, 0]})
     got = drive.recorded.map_from_vehicle
     assert np.degrees(np.abs(np.arctan2(got[:, 1, 0], got[:, 0, 0]) - yaw).max()) < 0.7
     assert np.abs(got[:, :3, 3] - points).max() < 0.03
     assert drive.headed_by_course
     with pytest.raises(DriveError, match="its z axis points down"):
-        with_topic(tmp_path / "wrong", made, poses)
+        with_topic(tmp_path / "wrong", messages, poses)
 
 
 def test_covariances_become_the_noise_unless_the_drive_says_otherwise(tmp_path):
     stamp_s, points, yaw = curve()
     covariance = np.diag([0.03**2, 0.03**2, 1.0, 0.1, 0.1, 0.004**2])
-    made = Messages()
+    messages = Messages()
     for t, point, angle in zip(stamp_s, points, yaw, strict=True):
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = Rotation.from_euler("z", angle).as_matrix(), point
-        made.add(t, "/pose", made.with_covariance(t, matrix, covariance))
-    drive = with_topic(tmp_path, made, {"topic": "/pose"})
+        messages.add(t, "/pose", messages.with_covariance(t, matrix, covariance))
+    drive = with_topic(tmp_path, messages, {"topic": "/pose"})
     assert drive.pose_noise.position_m == pytest.approx(0.03)
     assert drive.pose_noise.position_drift_m == pytest.approx(0.03 / np.sqrt(2))
     assert drive.pose_noise.heading_rad == pytest.approx(0.004)
@@ -425,13 +427,15 @@ def test_poses_of_transforms_over_a_moving_and_a_fixed_edge(tmp_path):
     map_from_odom[:3, :3] = Rotation.from_euler("z", 0.7).as_matrix()
     map_from_odom[:3, 3] = [5.0, -2.0, 0.0]
     base_from_gnss[:3, 3] = LEVER_M
-    made = Messages()
+    messages = Messages()
     for t, point, angle in zip(stamp_s, points, yaw, strict=True):
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = Rotation.from_euler("z", angle).as_matrix(), point
-        made.add(t, "/tf", made.transforms(t, {("odom", "gnss"): np.linalg.inv(map_from_odom) @ matrix}))
+        messages.add(
+            t, "/tf", messages.transforms(t, {("odom", "gnss"): np.linalg.inv(map_from_odom) @ matrix})
+        )
     edges = {("map", "odom"): map_from_odom, ("base_link", "gnss"): base_from_gnss}
-    made.rows.insert(0, (START_S, "/tf_static", made.transforms(START_S, edges)))
-    drive = with_topic(tmp_path, made, {"topic": "/tf", "frame": "map", "vehicle": "base_link"})
+    messages.rows.insert(0, (START_S, "/tf_static", messages.transforms(START_S, edges)))
+    drive = with_topic(tmp_path, messages, {"topic": "/tf", "frame": "map", "vehicle": "base_link"})
     expected = 2 * points - antenna(points, yaw)
     np.testing.assert_allclose(drive.recorded.map_from_vehicle[:, :3, 3], expected, atol=1e-6)

@@ -81,7 +81,7 @@ def test_a_table_counts_its_quality_and_says_nothing_without(header, fixed, tmp_
     ids=["float", "single", "none", "no covariance", "no status", "augmented"],
 )
 def test_a_navsatfix_counts_its_status_with_its_sigma(fixes, expected):
-    made = [Messages().fix(1.0, (53.5, 9.0, 5.0), status, sigma_m, "gnss") for status, sigma_m in fixes]
-    rows = np.array([position_row(FIX, fix) for fix in made])
+    messages = [Messages().fix(1.0, (53.5, 9.0, 5.0), status, sigma_m, "gnss") for status, sigma_m in fixes]
+    rows = np.array([position_row(FIX, fix) for fix in messages])
     got = readings_of(FIX, (np.arange(len(rows)) / 10, rows), None, "here").is_fixed
     assert (None if got is None else got.tolist()) == expected

@@ -26,21 +26,21 @@ LENS = CameraInfo(
 
 def renamed(folder, topic):
     """The messages of ``folder`` with its front images on ``topic``."""
-    made = messages_of(folder)
-    made.rows = [(at, topic if name == RAW else name, message) for at, name, message in made.rows]
-    return made
+    messages = messages_of(folder)
+    messages.rows = [(at, topic if name == RAW else name, message) for at, name, message in messages.rows]
+    return messages
 
 
 def rectified_bag(folder, path, topic):
     """The bag of ``folder`` whose front images are on ``topic``, turned by TURN, of a lens that bends."""
-    made = renamed(folder, topic)
-    for _, name, message in made.rows:
+    messages = renamed(folder, topic)
+    for _, name, message in messages.rows:
         if name == "/sensing/front/camera_info":
             message.d[:] = LENS.distortion
             message.p[[0, 5]] = 47.0, 47.5
             message.p[3] = -9.4  # of a stereo pair's right camera
             message.r[:] = TURN.ravel()
-    return write_ros2(path, made)
+    return write_ros2(path, messages)
 
 
 def drive_of(folder, tmp_path, topic, **info):
@@ -107,7 +107,7 @@ def test_a_driver_that_states_no_p_or_r_is_taken_at_its_word_or_refused():
     message.p[:] = Messages().info(1.0, LENS, "cam").p
     for wrong in (2.0, 1e308, -1.0):
         message.r[:] = np.diag([1.0, 1.0, wrong]).ravel()
-        with pytest.raises(DriveError, match="here, R: is no rotation"):
+        with pytest.raises(DriveError, match="here, R: is not a rotation"):
             info_of(message, "cam", "here", rectified=True)
 
 
@@ -182,7 +182,7 @@ def test_files_without_p_are_of_the_rectified_images_if_their_lens_has_no_distor
     [("projection_matrix", np.eye(3), "projection_matrix: expected 3 x 4"),
      ("projection_matrix", np.zeros((3, 4)), "states no P"),
      ("projection_matrix", -np.eye(3, 4), "front.yaml"),
-     ("rectification_matrix", 2 * np.eye(3), "rectification_matrix: is no rotation")],
+     ("rectification_matrix", 2 * np.eye(3), "rectification_matrix: is not a rotation")],
 )  # fmt: skip
 def test_a_file_whose_p_or_r_cannot_be_is_refused(key, matrix, problem, tmp_path):
     path = as_file(tmp_path / "front.yaml", "camera_info")

@@ -201,16 +201,16 @@ def road_of(ground):
 
 def test_a_plane_is_even_and_a_crest_is_found_where_it_is():
     assert unevenness(road_of(plane(0.05, 0.02)), 15.0).value_m < 1e-9
-    found = unevenness(road_of(ramp(70.0, 20.0, 1.0)), 15.0)
+    uneven = unevenness(road_of(ramp(70.0, 20.0, 1.0)), 15.0)
     # The ramp's ends are at 70 and 90 m; at 80 m, its middle, a plane of 7.9 % would go on beyond both.
-    assert 60.0 < found.station_m < 100.0
-    assert found.value_m > 0.3
-    np.testing.assert_allclose(found.at_map, [found.station_m, 0.0])
+    assert 60.0 < uneven.station_m < 100.0
+    assert uneven.value_m > 0.3
+    np.testing.assert_allclose(uneven.at_map, [uneven.station_m, 0.0])
 
 
 def test_a_cross_fall_that_changes_makes_a_road_uneven_beside_the_path():
     points = straight()[0]
     slope = np.column_stack([np.zeros(len(points)), np.where(points[:, 0] < 75.0, 0.02, -0.02)])
-    found = unevenness(Road(points, np.zeros(len(points)), slope), 10.0)
-    assert found.value_m == pytest.approx(3.5 * 0.04)
-    assert found.station_m == pytest.approx(75.0, abs=10.0)
+    uneven = unevenness(Road(points, np.zeros(len(points)), slope), 10.0)
+    assert uneven.value_m == pytest.approx(3.5 * 0.04)
+    assert uneven.station_m == pytest.approx(75.0, abs=10.0)

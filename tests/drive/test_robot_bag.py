@@ -24,21 +24,21 @@ PREFIX = "tractor_07/"
 
 def robot(folder, infos="none", ros1=False, footprint=False):
     """All topics of a robot with two cameras on a roof bar: ``infos`` are none, or uncalibrated."""
-    made = messages_of(folder, ros1=ros1, fixed_frames=False)
+    messages = messages_of(folder, ros1=ros1, fixed_frames=False)
     tree = tree_of(PREFIX, footprint)
     rows = []
-    for stamp_s, topic, message in made.rows:
+    for stamp_s, topic, message in messages.rows:
         if topic == "/odom":
             message.header.frame_id = f"{PREFIX}map"
             message.child_frame_id = f"{PREFIX}base_link"
             rows.append((stamp_s, "/tractor_07/odometry/global", message))
             for number, (decoy, parent) in enumerate({"wheel/odom": "odom", "imu/odometry": "map"}.items()):
-                pose = made.odometry(
+                pose = messages.odometry(
                     stamp_s, at(number, 0.1 * stamp_s, 0), np.zeros(36), f"{PREFIX}base_link"
                 )
                 pose.header.frame_id = f"{PREFIX}{parent}"
                 rows.append((stamp_s, f"/tractor_07/{decoy}", pose))
-            fix = made.fix(stamp_s, (29.95, 122.05, 12.0), 0, 1.5, f"{PREFIX}gps")
+            fix = messages.fix(stamp_s, (29.95, 122.05, 12.0), 0, 1.5, f"{PREFIX}gps")
             rows.append((stamp_s, "/tractor_07/gps/fix", fix))
             continue
         camera = topic.split("/")[2]
@@ -51,20 +51,20 @@ def robot(folder, infos="none", ros1=False, footprint=False):
             continue
         rows.append((stamp_s, named, message))
         rows.append((stamp_s, named.replace("image_raw", "image_rect"), message))
-        depth = made.raw_image(stamp_s, np.zeros((8, 16), np.uint8), "16UC1", f"{PREFIX}{camera}_depth")
+        depth = messages.raw_image(stamp_s, np.zeros((8, 16), np.uint8), "16UC1", f"{PREFIX}{camera}_depth")
         depth.width = 8
         rows.append((stamp_s, f"/tractor_07/sensors/{camera}/depth/image_raw", depth))
     first_s = rows[0][0]
-    rows.append((first_s, "/tf_static", made.transforms(first_s, tree)))
-    made.rows = sorted(rows, key=lambda row: row[0])
-    return made, tree
+    rows.append((first_s, "/tf_static", messages.transforms(first_s, tree)))
+    messages.rows = sorted(rows, key=lambda row: row[0])
+    return messages, tree
 
 
 @pytest.mark.parametrize("ros1", [False, True])
 @pytest.mark.parametrize("infos", ["none", "uncalibrated"])
 def test_a_robot_s_bag_asks_once_for_what_it_lacks(infos, ros1, folder, tmp_path, capsys):
-    made, tree = robot(folder, infos, ros1)
-    bag = write_ros1(tmp_path / "site", made) if ros1 else write_ros2(tmp_path / "site", made)
+    messages, tree = robot(folder, infos, ros1)
+    bag = write_ros1(tmp_path / "site", messages) if ros1 else write_ros2(tmp_path / "site", messages)
     check = ["check", str(bag), "--no-ground", "--output", "out", "--write", "drive"]
     assert run(check) == 2
     error = capsys.readouterr().err
@@ -89,8 +89,8 @@ def test_a_robot_s_bag_asks_once_for_what_it_lacks(infos, ros1, folder, tmp_path
 
 def test_what_was_decided_is_said_and_the_height_that_nothing_states(folder, tmp_path, caplog):
     caplog.set_level("INFO", "v2hdm.io")
-    made, _ = robot(folder)
-    missing = draft_drive(write_ros2(tmp_path / "site", made), tmp_path / "drive", [])
+    messages, _ = robot(folder)
+    missing = draft_drive(write_ros2(tmp_path / "site", messages), tmp_path / "drive", [])
     assert len(missing) == 2
     for words in (
         "/front/image_rect left out: rectified images of the same sensor as /tractor_07/sensors/front/",
@@ -103,20 +103,21 @@ def test_what_was_decided_is_said_and_the_height_that_nothing_states(folder, tmp
 
 def test_a_footprint_says_the_height_and_nothing_asks_for_it(folder, tmp_path, caplog):
     caplog.set_level("INFO", "v2hdm.io")
-    made, _ = robot(folder, footprint=True)
-    draft_drive(write_ros2(tmp_path / "site", made), tmp_path / "drive", [])
+    messages, _ = robot(folder, footprint=True)
+    draft_drive(write_ros2(tmp_path / "site", messages), tmp_path / "drive", [])
     assert "is taken to be on the ground" not in caplog.text
 
 
 def test_all_that_a_bag_lacks_is_asked_for_at_once_with_what_it_offers(folder, tmp_path):
     """Two antennas that are equals, no heading, intrinsics of another size, frames that nothing leads to."""
-    made = messages_of(folder, fixed_frames=False)
+    messages = messages_of(folder, fixed_frames=False)
     rows = []
-    for stamp_s, topic, message in made.rows:
+    for stamp_s, topic, message in messages.rows:
         if topic == "/odom":
             place = (29.95 + 1e-6 * stamp_s, 122.05, 12.0)
             rows += [
-                (stamp_s, f"/{end}/fix", made.fix(stamp_s, place, 2, 0.02, end)) for end in ("bow", "stern")
+                (stamp_s, f"/{end}/fix", messages.fix(stamp_s, place, 2, 0.02, end))
+                for end in ("bow", "stern")
             ]
         elif topic.endswith("camera_info"):
             rows.append((stamp_s, f"/calibration{topic}", message))
@@ -124,9 +125,9 @@ def test_all_that_a_bag_lacks_is_asked_for_at_once_with_what_it_offers(folder, t
             message.header.frame_id = "usb_cam"
             rows.append((stamp_s, topic, message))
     edges = {("base_link", "lidar"): at(0, 0, 1), ("base_link", "gnss_antenna"): at(1.5, 0, 2)}
-    rows.append((rows[0][0], "/tf_static", made.transforms(rows[0][0], edges)))
-    made.rows = sorted(rows, key=lambda row: row[0])
-    bag = write_ros2(tmp_path / "site", made)
+    rows.append((rows[0][0], "/tf_static", messages.transforms(rows[0][0], edges)))
+    messages.rows = sorted(rows, key=lambda row: row[0])
+    bag = write_ros2(tmp_path / "site", messages)
     missing = draft_drive(bag, tmp_path / "drive", [])
     cameras = [f"cameras.{name}.{key}" for name in ("front", "rear") for key in ("camera_info", "mounting")]
     of_poses = ["poses.topic", "poses.heading_topic", "poses.lever_arm_m"]
@@ -150,19 +151,19 @@ def test_all_that_a_bag_lacks_is_asked_for_at_once_with_what_it_offers(folder, t
 
 
 def test_one_antenna_is_one_question_and_its_gyro_is_found(folder, tmp_path):
-    made = messages_of(folder)
+    messages = messages_of(folder)
     rows = []
-    for stamp_s, topic, message in made.rows:
+    for stamp_s, topic, message in messages.rows:
         if topic == "/odom":
             place = (29.95 + 1e-6 * stamp_s, 122.05, 12.0)
-            rows.append((stamp_s, "/fix", made.fix(stamp_s, place, 2, 0.02, "gnss")))
-            imu = made.imu(stamp_s, np.eye(3), "imu")
+            rows.append((stamp_s, "/fix", messages.fix(stamp_s, place, 2, 0.02, "gnss")))
+            imu = messages.imu(stamp_s, np.eye(3), "imu")
             imu.orientation_covariance[0] = -1
             rows.append((stamp_s, "/imu", imu))
         else:
             rows.append((stamp_s, topic, message))
-    made.rows = rows
-    bag = write_ros2(tmp_path / "site", made)
+    messages.rows = rows
+    bag = write_ros2(tmp_path / "site", messages)
     missing = draft_drive(bag, tmp_path / "drive", [])
     about_heading = [key for key in missing if "heading" in key or "gyro" in key]
     assert about_heading == ["poses.heading_topic"]
@@ -176,12 +177,14 @@ def test_one_antenna_is_one_question_and_its_gyro_is_found(folder, tmp_path):
 
 def test_what_one_topic_of_poses_alone_needs_is_asked_for_together_with_the_topic(folder, tmp_path):
     """Odometry of the vehicle's frame, and the same as poses that do not say of which frame they are."""
-    made = messages_of(folder)
-    for stamp_s, topic, message in list(made.rows):
+    messages = messages_of(folder)
+    for stamp_s, topic, message in list(messages.rows):
         if topic == "/odom":
-            pose = made.make("geometry_msgs/msg/PoseStamped", header=message.header, pose=message.pose.pose)
-            made.add(stamp_s, "/fused", pose)
-    bag = write_ros2(tmp_path / "site", made)
+            pose = messages.make(
+                "geometry_msgs/msg/PoseStamped", header=message.header, pose=message.pose.pose
+            )
+            messages.add(stamp_s, "/fused", pose)
+    bag = write_ros2(tmp_path / "site", messages)
     missing = draft_drive(bag, tmp_path / "drive", [])
     assert list(missing) == ["poses.topic", "poses.lever_arm_m"]
     assert missing["poses.lever_arm_m"].startswith("for /fused: /fused does not say of which frame its poses")
@@ -190,9 +193,9 @@ def test_what_one_topic_of_poses_alone_needs_is_asked_for_together_with_the_topi
 
 
 def test_poses_of_a_file_go_with_the_images_of_a_bag(folder, tmp_path):
-    made = messages_of(folder)
-    made.rows = [row for row in made.rows if row[1] != "/odom"]
-    bag = write_ros2(tmp_path / "site", made)
+    messages = messages_of(folder)
+    messages.rows = [row for row in messages.rows if row[1] != "/odom"]
+    bag = write_ros2(tmp_path / "site", messages)
     assert list(draft_drive(bag, tmp_path / "drive", [])) == ["poses.topic"]
     assert not draft_drive(bag, tmp_path / "drive", [f"poses.tum={folder / 'poses.tum'}"])
     assert_same_poses(read_drive("drive", ReadOptions(cache="cache")), read_drive(folder))

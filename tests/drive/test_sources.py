@@ -62,11 +62,11 @@ def test_a_video_with_poses_is_the_same_drive(folder):
     expected = read_drive(folder)
     write_video(folder, folder / "front.mkv")
     got = read(folder, {"video": "front.mkv", "start_s": 100.05})
-    for one, other in zip(by_camera(got), by_camera(expected), strict=True):
-        assert one.camera == other.camera
-        assert one.stamp_s == pytest.approx(other.stamp_s, abs=1e-7)
-        np.testing.assert_allclose(one.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
-        np.testing.assert_array_equal(cv2.imread(str(one.path)), cv2.imread(str(other.path)))
+    for image, other in zip(by_camera(got), by_camera(expected), strict=True):
+        assert image.camera == other.camera
+        assert image.stamp_s == pytest.approx(other.stamp_s, abs=1e-7)
+        np.testing.assert_allclose(image.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(cv2.imread(str(image.path)), cv2.imread(str(other.path)))
     decoded = [(image.path, image.path.stat().st_mtime_ns) for image in by_camera(got)]
     # Another start needs no decoding; neither does a second reading.
     later = read(folder, {"video": "front.mkv", "start_s": 100.06})
@@ -153,17 +153,17 @@ def test_a_folder_asks_for_what_its_names_leave_open(folder, tmp_path):
         for name, stem in (("dates", f"20240131_1015{number:02d}_125"), ("counts", f"{number:06d}")):
             (tmp_path / name).mkdir(exist_ok=True)
             shutil.copy(image, tmp_path / name / f"{stem}.png")
-    asked = draft_drive(tmp_path / "dates", tmp_path / "d", [])
-    assert "utc, or utc+01:00" in asked["cameras.dates.images.unit"]
-    asked = draft_drive(tmp_path / "counts", tmp_path / "d", [])
-    assert "a file with a time in s per image" in asked["cameras.counts.images.stamps"]
-    asked = draft_drive(tmp_path / "counts", tmp_path / "d", ["cameras.counts.images.unit=s"])
-    assert not [key for key in asked if "images" in key]
+    questions = draft_drive(tmp_path / "dates", tmp_path / "d", [])
+    assert "utc, or utc+01:00" in questions["cameras.dates.images.unit"]
+    questions = draft_drive(tmp_path / "counts", tmp_path / "d", [])
+    assert "a file with a time in s per image" in questions["cameras.counts.images.stamps"]
+    questions = draft_drive(tmp_path / "counts", tmp_path / "d", ["cameras.counts.images.unit=s"])
+    assert not [key for key in questions if "images" in key]
     (tmp_path / "front.h264").write_bytes(b"")
     assert "cameras.front.images.stamps" in draft_drive(tmp_path / "front.h264", tmp_path / "d", [])
     (tmp_path / "front.mp4").write_bytes(b"")
-    asked = draft_drive(tmp_path / "front.mp4", tmp_path / "d", ["cameras.front.images.stamps=a"])
-    assert not [key for key in asked if "images" in key]
+    questions = draft_drive(tmp_path / "front.mp4", tmp_path / "d", ["cameras.front.images.stamps=a"])
+    assert not [key for key in questions if "images" in key]
 
 
 def test_a_source_that_does_not_fit_is_named(folder):

@@ -162,19 +162,19 @@ def read(path, **options):
 
 def with_decoys(folder, encoding="16UC1", ros1=False):
     """The drive in ``folder`` with a camera of depth that has a frame of its own, and images with lanes."""
-    made = messages_of(folder, ros1=ros1)
-    for stamp_s, topic, message in list(made.rows):
+    messages = messages_of(folder, ros1=ros1)
+    for stamp_s, topic, message in list(messages.rows):
         if topic == "/sensing/front/camera_info":
             depth = np.zeros((12, 16), np.float32 if encoding == "32FC1" else np.uint16)
             rows = depth.view(np.uint8).reshape(12, -1)
-            picture = made.raw_image(stamp_s, rows, encoding, "depth_optical")
+            picture = messages.raw_image(stamp_s, rows, encoding, "depth_optical")
             picture.width = 16
-            made.add(stamp_s, "/sensing/depth/image_raw", picture)
-            made.add(stamp_s, "/sensing/depth/camera_info", message)
-            drawn = made.raw_image(stamp_s, np.zeros((48, 64, 3), np.uint8), "bgr8", "front_optical")
-            made.add(stamp_s, "/lanes/debug", drawn)
-    made.rows.sort(key=lambda row: row[0])
-    return made
+            messages.add(stamp_s, "/sensing/depth/image_raw", picture)
+            messages.add(stamp_s, "/sensing/depth/camera_info", message)
+            drawn = messages.raw_image(stamp_s, np.zeros((48, 64, 3), np.uint8), "bgr8", "front_optical")
+            messages.add(stamp_s, "/lanes/debug", drawn)
+    messages.rows.sort(key=lambda row: row[0])
+    return messages
 
 
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "mono16"])
@@ -205,8 +205,8 @@ def test_a_camera_is_left_out_by_null_or_by_naming_the_others(folder, tmp_path, 
         error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
         assert len(error) == 1
         assert message in error[0]
-    both = ["--set", "cameras.rear=null", "cameras.front=null"]
-    assert run([*check, "wrong", *both]) == 2
+    settings = ["--set", "cameras.rear=null", "cameras.front=null"]
+    assert run([*check, "wrong", *settings]) == 2
     assert "no camera is left" in capsys.readouterr().err
     assert not (tmp_path / "wrong").exists()
 
@@ -214,8 +214,8 @@ def test_a_camera_is_left_out_by_null_or_by_naming_the_others(folder, tmp_path, 
 def test_a_topic_that_was_left_out_is_taken_in_by_its_name(folder, tmp_path):
     bag = write_ros2(tmp_path / "site", with_decoys(folder))
     said = ["images.topic=/lanes/debug", "camera_info.topic=/sensing/front/camera_info"]
-    given = [f"cameras.lanes.{one}" for one in said]
-    check = ["check", str(bag), "--no-ground", "--output", "out", "--write", "d", "--set", *given]
+    settings = [f"cameras.lanes.{setting}" for setting in said]
+    check = ["check", str(bag), "--no-ground", "--output", "out", "--write", "d", "--set", *settings]
     assert run(check) in (0, 3)
     cameras = yaml.safe_load((tmp_path / "d" / "drive.yaml").read_text())["cameras"]
     assert list(cameras) == ["front", "rear", "lanes"]
@@ -223,11 +223,11 @@ def test_a_topic_that_was_left_out_is_taken_in_by_its_name(folder, tmp_path):
 
 
 def test_a_bag_of_depth_alone_has_no_camera(folder, tmp_path):
-    made = with_decoys(folder)
-    made.rows = [
+    messages = with_decoys(folder)
+    messages.rows = [
         row
-        for row in made.rows
+        for row in messages.rows
         if "front" not in row[1] and "rear" not in row[1] and row[1] != "/lanes/debug"
     ]
     with pytest.raises(DriveError, match=r"no camera is left; .*'16UC1'"):
-        read(write_ros2(tmp_path / "site", made))
+        read(write_ros2(tmp_path / "site", messages))

@@ -122,9 +122,9 @@ def test_poses_that_change_their_utm_zone_on_the_way_are_refused_with_the_place(
 
 
 def test_a_single_pose_serves_its_own_time_only():
-    one = Trajectory(np.array([7.0]), np.eye(4)[None])
+    single = Trajectory(np.array([7.0]), np.eye(4)[None])
     times: FloatArray = np.array([6.0, 7.0, 8.0])
-    assert interpolate(one, times, 1.0)[1].tolist() == [False, True, False]
+    assert interpolate(single, times, 1.0)[1].tolist() == [False, True, False]
 
 
 ORIGIN = GeodeticOrigin(50.0, 8.0, 120.0)
@@ -160,18 +160,18 @@ def test_drives_of_one_rig_share_its_cameras_and_no_frame(drives):
 
 
 def test_a_frame_of_another_origin_is_moved_to_its_place_on_the_earth(drives):
-    there = GeodeticOrigin(50.002, 8.003, 121.0)
+    far_origin = GeodeticOrigin(50.002, 8.003, 121.0)
     here_from_there = enu_from_geodetic(ORIGIN, np.array([[50.002, 8.003, 121.0]]))[0]
     image = drives[1].images[0].map_from_vehicle
     # The same place, written in the other frame.
     geodetic = geodetic_from_enu(ORIGIN, image[:3, 3][None])
-    local = enu_from_geodetic(there, geodetic)[0]
+    local = enu_from_geodetic(far_origin, geodetic)[0]
     moved = [
-        replace(one, map_from_vehicle=_shifted(one.map_from_vehicle, local[:2] - image[:2, 3]))
-        for one in drives[1].images
+        replace(later, map_from_vehicle=_shifted(later.map_from_vehicle, local[:2] - image[:2, 3]))
+        for later in drives[1].images
     ]
-    joined = join_drives([drives[0], replace(drives[1], origin=there, images=moved)])
-    back = next(one for one in joined.images if one.session == 1).map_from_vehicle
+    joined = join_drives([drives[0], replace(drives[1], origin=far_origin, images=moved)])
+    back = next(image for image in joined.images if image.session == 1).map_from_vehicle
     assert back[:2, 3] == pytest.approx(image[:2, 3], abs=2e-3)
     # The meridians converge by the difference of longitude times the sine of the latitude.
     convergence = np.radians(0.003) * np.sin(np.radians(50.0))
@@ -195,8 +195,8 @@ def test_a_camera_with_another_lens_or_mounting_is_another_camera(drives, caplog
     assert joined.cameras[f"{name}@friday"].info.name == f"{name}@friday"
     assert {image.camera for image in joined.images if image.session == 1} >= {f"{name}@friday"}
     assert f"calibrated separately, as {name}@friday" in caplog.text
-    apart = join_drives(drives, [(1, name)])
-    assert f"{name}@friday" in apart.cameras
+    joined_apart = join_drives(drives, [(1, name)])
+    assert f"{name}@friday" in joined_apart.cameras
 
 
 def test_drives_that_have_nothing_in_common_are_refused(drives):
@@ -219,7 +219,7 @@ def test_each_session_has_clocks_of_its_own(drives):
     joined = join_drives(drives)
     name = next(iter(joined.cameras))
     moved = with_clock_offsets(joined, {name: 0.05}, max_gap_s=1.0, session=1)
-    offsets = {(one.session, one.camera): one.clock_offset_s for one in moved.images}
+    offsets = {(image.session, image.camera): image.clock_offset_s for image in moved.images}
     assert offsets[0, name] == 0.0
     assert offsets[1, name] == 0.05
 

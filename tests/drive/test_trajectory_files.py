@@ -86,8 +86,8 @@ def test_the_week_of_an_sbet_is_the_images_or_stated_or_asked_for(tmp_path):
         read(content, tmp_path, near_s=None)
     utc = read(content | {"clock": "utc"}, tmp_path).trajectory.stamp_s
     np.testing.assert_allclose(utc, STAMP_S + 18)
-    own = read(content, tmp_path, near_s=float(TOW_S[5])).trajectory.stamp_s
-    np.testing.assert_allclose(own, TOW_S)
+    stamps_s = read(content, tmp_path, near_s=float(TOW_S[5])).trajectory.stamp_s
+    np.testing.assert_allclose(stamps_s, TOW_S)
 
 
 def test_an_sbet_goes_on_past_the_end_of_the_week(tmp_path):
@@ -267,7 +267,7 @@ def test_a_solution_in_nmea_is_a_log(tmp_path):
 
 
 def ubx_messages(attitude="NAV-ATT", position="NAV-HPPOSLLH"):
-    made = []
+    messages = []
     for k, (lat, lon, height) in enumerate(PLACES):
         of_week = {"iTOW": round(TOW_S[k] * 1000)}
         at = np.datetime64(round(STAMP_S[k] * 1000), "ms").item()
@@ -279,13 +279,13 @@ def ubx_messages(attitude="NAV-ATT", position="NAV-HPPOSLLH"):
             lon=lon, height=round(height * 1000), hAcc=14, headVehValid=int(attitude == "NAV-PVT"), headVeh=heading,
             headAcc=0.3,
         )  # fmt: skip
-        made.append(pyubx2.UBXMessage("NAV", "NAV-PVT", pyubx2.GET, **of_week, **solution))
+        messages.append(pyubx2.UBXMessage("NAV", "NAV-PVT", pyubx2.GET, **of_week, **solution))
         if position == "NAV-HPPOSLLH":
             fine = {"height": round(height * 1000), "hAcc": 14.0}
             for key, degrees in (("lat", lat), ("lon", lon)):
                 fine[key] = round(degrees * 1e7) / 1e7
                 fine[f"_HP{key}"] = degrees - fine[key]
-            made.append(pyubx2.UBXMessage("NAV", "NAV-HPPOSLLH", pyubx2.GET, **of_week, **fine))
+            messages.append(pyubx2.UBXMessage("NAV", "NAV-HPPOSLLH", pyubx2.GET, **of_week, **fine))
         if attitude == "NAV-ATT":
             turned = {
                 "roll": 0.0,
@@ -295,12 +295,12 @@ def ubx_messages(attitude="NAV-ATT", position="NAV-HPPOSLLH"):
                 "accPitch": 0.4,
                 "accHeading": 0.3,
             }
-            made.append(pyubx2.UBXMessage("NAV", "NAV-ATT", pyubx2.GET, **of_week, **turned))
+            messages.append(pyubx2.UBXMessage("NAV", "NAV-ATT", pyubx2.GET, **of_week, **turned))
         elif attitude == "NAV-RELPOSNED":
             valid = {"gnssFixOK": 1, "relPosValid": 1, "carrSoln": 2, "isMoving": 1, "relPosHeadingValid": 1}
             baseline = {"version": 1, "relPosHeading": heading, "accHeading": 0.3} | valid
-            made.append(pyubx2.UBXMessage("NAV", "NAV-RELPOSNED", pyubx2.GET, **of_week, **baseline))
-    return made
+            messages.append(pyubx2.UBXMessage("NAV", "NAV-RELPOSNED", pyubx2.GET, **of_week, **baseline))
+    return messages
 
 
 def as_json(message):

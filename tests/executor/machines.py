@@ -46,11 +46,11 @@ class Machines:
 
     def _start(self, kind, *arguments, cwd=None, environment=None, most_bytes=None):
         log = (self.folder / f"{kind}-{len(self.processes)}.log").open("w")
-        given = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **(environment or {})}
+        variables = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **(environment or {})}
         limited = [] if most_bytes is None else ["prlimit", f"--fsize={most_bytes}"]
         process = subprocess.Popen(
             [*limited, DASK, kind, *arguments], cwd=cwd or ROOT, stdout=log, stderr=log,
-            start_new_session=True, env=os.environ | given,
+            start_new_session=True, env=os.environ | variables,
         )  # fmt: skip
         log.close()
         self.processes.append(process)
@@ -58,10 +58,10 @@ class Machines:
 
     def worker(self, *arguments, **how):
         """Start a worker; it can write files of ``most_bytes``, as if its disk were full."""
-        given = arguments or ("--nthreads", "1")
+        options = arguments or ("--nthreads", "1")
         host = ["--host", "127.0.0.1"]
         name = ["--local-directory", str(self.folder), "--no-dashboard", "--death-timeout", "30"]
-        return self._start("worker", self.address, *host, *name, *given, *self.files, **how)
+        return self._start("worker", self.address, *host, *name, *options, *self.files, **how)
 
     def wait_for(self, workers):
         """Wait until so many workers are there."""

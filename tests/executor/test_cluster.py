@@ -60,19 +60,19 @@ def opened(machines, **paths):
 
 def test_jobs_are_done_by_workers_that_a_user_has_started_where_the_client_is(machines):
     with opened(machines) as executor:
-        done = dict(executor.side_by_side(where, range(8)))
-        taken = []
-        executor.share_out(slowly_doubled, range(9), nothing, (), taken.append)
-        told = []
-        stepped = dict(executor.side_by_side(step_by_step, [5], lambda *step: told.append(step)))
+        outcomes = dict(executor.side_by_side(where, range(8)))
+        results = []
+        executor.share_out(slowly_doubled, range(9), nothing, (), results.append)
+        steps = []
+        stepped = dict(executor.side_by_side(step_by_step, [5], lambda *step: steps.append(step)))
         with pytest.raises(DriveError, match="x: damaged"):
             executor.share_out(refuse, ["x"], nothing, (), print)
     assert executor.workers == 2
-    assert {folder for _, folder in done.values()} == {str(Path.cwd())}
-    assert os.getpid() not in {process for process, _ in done.values()}
-    assert taken == [0, 2, 4, 6, 8, 10, 12, 14, 16]
+    assert {folder for _, folder in outcomes.values()} == {str(Path.cwd())}
+    assert os.getpid() not in {process for process, _ in outcomes.values()}
+    assert results == [0, 2, 4, 6, 8, 10, 12, 14, 16]
     assert stepped == {0: -5}
-    assert told[-1] == (5, "count", 3, 3)
+    assert steps[-1] == (5, "count", 3, 3)
 
 
 def test_a_job_whose_worker_is_killed_is_done_again_and_one_that_is_killed_twice_is_an_error(

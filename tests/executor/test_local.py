@@ -80,9 +80,9 @@ def two(request):
 
 
 def test_results_come_in_the_order_of_the_jobs(two):
-    taken: list[int] = []
-    two.share_out(slowly_doubled, range(9), nothing, (), taken.append)
-    assert taken == [0, 2, 4, 6, 8, 10, 12, 14, 16]
+    results: list[int] = []
+    two.share_out(slowly_doubled, range(9), nothing, (), results.append)
+    assert results == [0, 2, 4, 6, 8, 10, 12, 14, 16]
 
 
 def test_many_jobs_are_handed_over_together_and_their_results_come_in_order(two):
@@ -118,9 +118,9 @@ def test_a_job_that_kills_its_processes_takes_no_other_with_it(two):
 
 
 def test_each_process_has_one_thread(two):
-    done = dict(two.side_by_side(variables, range(2)))
-    assert {outcome[:2] for outcome in done.values()} == {("1", 1)}
-    assert os.getpid() not in {outcome[2] for outcome in done.values()}
+    outcomes = dict(two.side_by_side(variables, range(2)))
+    assert {outcome[:2] for outcome in outcomes.values()} == {("1", 1)}
+    assert os.getpid() not in {outcome[2] for outcome in outcomes.values()}
 
 
 def test_no_more_processes_start_than_there_are_jobs():
@@ -134,22 +134,22 @@ def test_no_more_processes_start_than_there_are_jobs():
 
 
 def test_jobs_tell_their_steps_and_processes_stay_for_the_next_stage():
-    told = []
+    steps = []
     with open_executor(2) as executor:
-        done = dict(executor.side_by_side(step_by_step, [5, 6], lambda *step: told.append(step)))
-        first = {done[number] for number in done}
+        outcomes = dict(executor.side_by_side(step_by_step, [5, 6], lambda *step: steps.append(step)))
+        first = {outcomes[number] for number in outcomes}
         processes = [
             {outcome[2] for _, outcome in executor.side_by_side(variables, range(8))} for _ in range(2)
         ]
     assert first == {-5, -6}
-    assert {(5, "count", 3, 3), (6, "count", 3, 3)} <= set(told)
+    assert {(5, "count", 3, 3), (6, "count", 3, 3)} <= set(steps)
     assert len(processes[0] | processes[1]) <= 2
 
 
 def take_a_gigabyte(job, progress):
-    taken = np.ones(125_000_000)
+    memory = np.ones(125_000_000)
     time.sleep(5.0)
-    return taken.nbytes
+    return memory.nbytes
 
 
 def test_a_process_that_takes_more_memory_than_it_may_is_an_error_of_its_job_alone():
@@ -161,19 +161,19 @@ def test_a_process_that_takes_more_memory_than_it_may_is_an_error_of_its_job_alo
 
 
 def share_out_further(numbers, progress):
-    taken = []
+    results = []
     with open_executor(2) as executor:
-        executor.share_out(slowly_doubled, numbers, nothing, (), taken.append)
-    return taken
+        executor.share_out(slowly_doubled, numbers, nothing, (), results.append)
+    return results
 
 
 def test_a_job_may_share_its_work_out_to_the_same_processes():
     with open_executor(2) as executor:
-        done = dict(executor.side_by_side(share_out_further, [range(6), range(4)]))
+        outcomes = dict(executor.side_by_side(share_out_further, [range(6), range(4)]))
         before = len(multiprocessing.active_children())
         dict(executor.side_by_side(share_out_further, [range(5)]))
         assert len(multiprocessing.active_children()) == before
-    assert done == {0: [0, 2, 4, 6, 8, 10], 1: [0, 2, 4, 6]}
+    assert outcomes == {0: [0, 2, 4, 6, 8, 10], 1: [0, 2, 4, 6]}
 
 
 def test_one_worker_is_this_process_unless_a_death_must_be_survived():
@@ -198,8 +198,8 @@ def test_a_base_install_has_processes_without_dask(monkeypatch):
 def begun(code, **pipes):
     """A session of processes that runs this."""
     code = f"if __name__ == '__main__':\n  from tests.executor.test_local import *; {code}"
-    given = {"cwd": ROOT, "stderr": subprocess.PIPE, "text": True, "start_new_session": True, **pipes}
-    return subprocess.Popen([sys.executable, "-uc", code], **given)
+    options = {"cwd": ROOT, "stderr": subprocess.PIPE, "text": True, "start_new_session": True, **pipes}
+    return subprocess.Popen([sys.executable, "-uc", code], **options)
 
 
 def opened(kind, work):

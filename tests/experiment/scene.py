@@ -13,7 +13,7 @@ CALIBRATED, ESTIMATED = "calibrated", "estimated"
 
 
 def diamonds(corners: np.ndarray, lanes: tuple[Lane, ...] = ()) -> HDMap:
-    return HDMap(tuple(Marking(DIAMOND, own, 5) for own in corners), lanes)
+    return HDMap(tuple(Marking(DIAMOND, corners_of_one, 5) for corners_of_one in corners), lanes)
 
 
 def shifted(metres: float, markings: int = 5) -> HDMap:

@@ -33,18 +33,21 @@ def composed(*overrides):
 
 
 def test_both_ports_are_driven_with_every_one_of_five_seeds():
-    found = jobs(composed())
-    assert {(job.port, job.seed) for job in found} == {
+    all_jobs = jobs(composed())
+    assert {(job.port, job.seed) for job in all_jobs} == {
         (p, s) for p in ("port1", "port2") for s in range(1, 6)
     }
-    assert all(job.site.simulate is not None and job.site.simulate.seed == job.seed for job in found)
-    starts = {job.port: job.site.simulate.initial_ipm for job in found if job.site.simulate}
+    assert all(job.site.simulate is not None and job.site.simulate.seed == job.seed for job in all_jobs)
+    starts = {job.port: job.site.simulate.initial_ipm for job in all_jobs if job.site.simulate}
     assert starts == {"port1": "calibrated", "port2": "estimated"}
 
 
 def test_recipes_differ_in_what_they_are_named_for():
     options = jobs(composed())[0].options
-    said = {name: (one.pose_model, one.loss, one.mode) for name, one in options.items()}
+    said = {
+        name: (solve_options.pose_model, solve_options.loss, solve_options.mode)
+        for name, solve_options in options.items()
+    }
     assert (said["paper"], said["ours"]) == (("paper", "none", "batch"), ("auto", "cauchy", "batch"))
     assert said["incremental"][2] == "incremental"
 
@@ -120,8 +123,8 @@ def test_errors_come_in_the_order_in_which_the_vehicle_passed():
     plain = record("port1", 1, CALIBRATED)
     shuffled = [3, 1, 4, 0, 2]
     plain["maps"]["both"]["Opt"] = diamonds(TRUE[shuffled] + 0.01)
-    found = measure(plain).matched["both"]["Opt"]
-    assert found.true.tolist() == [0, 1, 2, 3, 4]
+    matched = measure(plain).matched["both"]["Opt"]
+    assert matched.true.tolist() == [0, 1, 2, 3, 4]
 
 
 def test_claims_are_tested_where_the_start_of_the_port_allows_it():
@@ -181,7 +184,7 @@ def test_an_experiment_is_tables_figures_and_text_of_its_drives(tmp_path, monkey
     made_up = lambda job, *_: record(job.port, job.seed, starts[job.port])  # noqa: E731
     monkeypatch.setattr("v2hdm.experiment.run.drive_record", made_up)
     folder, measured = run_experiment(experiment(str(tmp_path)), "name: x\n", lambda *_: None)
-    assert [one.title for one in measured] == ["port1", "port2"]
+    assert [drive.title for drive in measured] == ["port1", "port2"]
     captions = (folder / "figures.md").read_text()
     pictures = sorted(path.name for path in folder.glob("*.png"))
     assert set(pictures) == {"eni_oni_port1.png", "eni_oni_port2.png", "corners.png"}
@@ -211,17 +214,17 @@ def test_a_drive_is_mapped_by_every_recipe_and_its_stages_are_kept(tiny_drive, t
     ports = {"small": Site(drive=DriveConfig(path=str(tiny_drive)))}
     config = experiment("out", ports=ports, recipes=["paper"], cache=str(tmp_path))
     (job,) = jobs(config)
-    told: list[tuple[str, int, int]] = []
-    found = drive_record(job, lambda *message: told.append(message))
-    rows = measure(found).rows["front"]
+    messages: list[tuple[str, int, int]] = []
+    record = drive_record(job, lambda *message: messages.append(message))
+    rows = measure(record).rows["front"]
     assert set(rows) >= {"Opt", "ONI", "Opt, paper", "ONI, paper"}
-    assert not found["failures"]
+    assert not record["failures"]
     assert rows["Opt"].recall > 0.8
     assert rows["Opt"].rmse_m < rows["ENI"].rmse_m
-    assert ("detect", 0, len(found["route"])) in told
+    assert ("detect", 0, len(record["route"])) in messages
 
-    told.clear()
-    again = drive_record(job, lambda *message: told.append(message))
-    assert repr(again) == repr(found)
-    assert ("detect", len(found["route"]), len(found["route"])) in told
-    assert ("detect", 0, len(found["route"])) not in told
+    messages.clear()
+    again = drive_record(job, lambda *message: messages.append(message))
+    assert repr(again) == repr(record)
+    assert ("detect", len(record["route"]), len(record["route"])) in messages
+    assert ("detect", 0, len(record["route"])) not in messages

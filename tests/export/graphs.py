@@ -21,15 +21,17 @@ def graphs_made_once() -> Iterator[None]:
     """In modules that import this, the graph of a network is that of one like it, with its own weights."""
     with pytest.MonkeyPatch.context() as patch:
         original = onnx_file.graph_of
-        patch.setattr(onnx_file, "graph_of", lambda *given: _graph(original, *given))
+        patch.setattr(onnx_file, "graph_of", lambda *arguments: _graph(original, *arguments))
         yield
 
 
-def _graph(original: Callable[..., onnx.ModelProto], module: nn.Module, *given: Any) -> onnx.ModelProto:
+def _graph(original: Callable[..., onnx.ModelProto], module: nn.Module, *arguments: Any) -> onnx.ModelProto:
     weights = module.state_dict()
-    structure = repr((module, [(name, one.shape, one.dtype) for name, one in weights.items()], given))
+    structure = repr(
+        (module, [(name, weight.shape, weight.dtype) for name, weight in weights.items()], arguments)
+    )
     if structure not in _made:
-        _made[structure] = original(_with_other_weights(module), *given)
+        _made[structure] = original(_with_other_weights(module), *arguments)
     model = deepcopy(_made[structure])
     initializers = {tensor.name: tensor for tensor in model.graph.initializer}
     for name, value in weights.items():

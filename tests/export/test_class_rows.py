@@ -70,14 +70,14 @@ def test_only_the_channels_of_changed_classes_are_others(tmp_path):
     written = outputs_of(tmp_path / "net.onnx")
     np.testing.assert_array_equal(written[0], shipped[0])
     np.testing.assert_array_equal(written[2], shipped[2])
-    known = shipped[1].shape[1]
-    is_same = [np.array_equal(written[1][:, k], shipped[1][:, k]) for k in range(known)]
-    assert is_same == [k != stop_line for k in range(known)]
+    count = shipped[1].shape[1]
+    is_same = [np.array_equal(written[1][:, k], shipped[1][:, k]) for k in range(count)]
+    assert is_same == [k != stop_line for k in range(count)]
     with torch.inference_mode():
         kinds = source.net(torch.from_numpy(images())).kinds.numpy()
     # Rounding moves the new channels by no more than the old ones.
     moved = np.abs(written[1] - kinds).mean(axis=(0, 2, 3))
-    assert moved[[stop_line, known]].max() < 2 * moved[:known].max()
+    assert moved[[stop_line, count]].max() < 2 * moved[:count].max()
 
 
 def test_channels_that_new_classes_read_are_rounded_behind_the_others(tmp_path):
@@ -87,14 +87,14 @@ def test_channels_that_new_classes_read_are_rounded_behind_the_others(tmp_path):
     written = outputs_of(tmp_path / "net.onnx")
     np.testing.assert_array_equal(written[0], shipped[0])
     np.testing.assert_array_equal(written[2], shipped[2])
-    known = shipped[1].shape[1]
+    count = shipped[1].shape[1]
     # A product of matrices with more rows is added up in another order.
-    np.testing.assert_allclose(written[1][:, :known], shipped[1], atol=1e-4)
+    np.testing.assert_allclose(written[1][:, :count], shipped[1], atol=1e-4)
     with torch.inference_mode():
         kinds = source.net(torch.from_numpy(images())).kinds.numpy()
     # Rounding moves the new class by no more of its range than others.
     moved = np.abs(written[1] - kinds).mean(axis=(0, 2, 3)) / kinds.std(axis=(0, 2, 3))
-    assert moved[known] < 1.5 * moved[:known].max()
+    assert moved[count] < 1.5 * moved[:count].max()
 
 
 def test_channels_beside_others_that_changed_are_refused(tmp_path):

@@ -130,21 +130,23 @@ def test_it_says_nearly_what_the_network_says(source, model, images):
 
 def test_so_does_a_network_of_another_make(images):
     net = network(replace(SMALL, separable=False, lanes=False, wide_kinds=False), images)
-    made = to_int8(to_onnx(deepcopy(net).fold(), 18), images)
-    assert {o: e for o, e in errors(net, made, images).items() if not e < 0.1} == {}
+    rounded = to_int8(to_onnx(deepcopy(net).fold(), 18), images)
+    assert {o: e for o, e in errors(net, rounded, images).items() if not e < 0.1} == {}
 
 
 def test_rounding_in_turn_keeps_what_the_first_layer_computes(plain, images):
     """Its inputs are 16 neighbouring pixels, alike: the errors of their weights are made to cancel."""
     graph = Graph(plain)
     stem = graph.convolutions[0]
-    moments = sum(input_moments(stem, seen[stem.input]) for seen in graph.run([stem.input], images))
+    moments = sum(input_moments(stem, inputs[stem.input]) for inputs in graph.run([stem.input], images))
     weight, bias = graph.weights[stem.weight], graph.weights[stem.bias]
     whole, scale, new_bias = round_weights(weight, bias, moments, HIGHEST_WEIGHT)
     steps = scale[:, None, None, None]
     in_turn = np.column_stack([(whole * steps - weight).reshape(len(bias), -1), new_bias - bias])
-    each = np.column_stack([(np.round(weight / steps) * steps - weight).reshape(len(bias), -1), 0 * bias])
-    ours, plain = (np.einsum("ni,ij,nj->", error, moments[0], error) for error in (in_turn, each))
+    rounding_errors = np.column_stack(
+        [(np.round(weight / steps) * steps - weight).reshape(len(bias), -1), 0 * bias]
+    )
+    ours, plain = (np.einsum("ni,ij,nj->", error, moments[0], error) for error in (in_turn, rounding_errors))
     assert ours < 0.5 * plain
 
 
@@ -221,11 +223,11 @@ def test_what_is_not_a_number_is_beyond_every_bound():
 def test_a_float_file_becomes_int8_as_its_checkpoint_does(source, quick, tmp_path):
     export_float(source, tmp_path / "float.onnx", 18, 1e-3)
     again = read_source(tmp_path / "float.onnx")
-    one, other = (
+    from_float, other = (
         export_int8(s, tmp_path / "int8.onnx", 18, Int8Config(bounds=ANY), lambda share, doing: None)
         for s in (source, again)
     )
-    assert asdict(one) == pytest.approx(asdict(other), abs=0.02)
+    assert asdict(from_float) == pytest.approx(asdict(other), abs=0.02)
     assert again.label["commit"] == source.label["commit"]
 
 
@@ -245,13 +247,15 @@ def test_an_int8_file_is_not_rounded_again(file):
 
 
 def test_images_are_what_the_detector_looks_at():
-    seen = list(looks(11, 2, ((640, 352),)))
+    pictures = list(looks(11, 2, ((640, 352),)))
     again = list(looks(11, 2, ((640, 352),)))
-    assert all(image.shape[0] % 16 == 0 and image.shape[1] in (640, 320) for part in seen for image in part)
     assert all(
-        np.array_equal(a, b) for x, y in zip(seen, again, strict=True) for a, b in zip(x, y, strict=True)
+        image.shape[0] % 16 == 0 and image.shape[1] in (640, 320) for part in pictures for image in part
     )
-    assert not np.array_equal(seen[0][0], seen[1][0])
+    assert all(
+        np.array_equal(a, b) for x, y in zip(pictures, again, strict=True) for a, b in zip(x, y, strict=True)
+    )
+    assert not np.array_equal(pictures[0][0], pictures[1][0])
 
 
 def test_int8_without_renders_says_what_to_set(source, quick, tmp_path):
@@ -303,8 +307,8 @@ def thought_out():
     return before(CONFIG)
 
 
-def check_same(one, other):
-    sessions = [open_session(model.SerializeToString()) for model in (one, other)]
+def check_same(model, other):
+    sessions = [open_session(model.SerializeToString()) for model in (model, other)]
     for size in SIZES:
         said = [session.run(list(Prediction._fields), {"image": noise(*size)[None]}) for session in sessions]
         for name, a, b in zip(Prediction._fields, *said, strict=True):
@@ -330,7 +334,7 @@ def test_nothing_slow_is_left_nor_anything_unused(thought_out):
 
 
 def test_weights_keep_their_names_and_values(thought_out):
-    kept = {t.name: numpy_helper.to_array(t) for t in after(thought_out).graph.initializer}
+    weights = {t.name: numpy_helper.to_array(t) for t in after(thought_out).graph.initializer}
     for tensor in thought_out.graph.initializer:
         if tensor.name.endswith((".weight", ".weight.bytes", ".bias", ".bias.bytes")):
-            np.testing.assert_array_equal(kept[tensor.name], numpy_helper.to_array(tensor))
+            np.testing.assert_array_equal(weights[tensor.name], numpy_helper.to_array(tensor))

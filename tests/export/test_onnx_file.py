@@ -124,12 +124,12 @@ def test_the_shipped_detector_finds_fresh_paint_where_it_is():
         sample = training_sample(424242, index, 448, 256, difficulty=0.0)
         (paint,) = session.run(["paint"], {"image": sample.image[None]})
         target = paint_target(sample.labels)
-        found, painted = paint[0, 0] > 0, target == 1
+        is_paint, painted = paint[0, 0] > 0, target == 1
         if painted.sum() > 150:
-            recall.append(found[painted].mean())
-            precision.append(painted[found & (target != IGNORE)].mean())
+            recall.append(is_paint[painted].mean())
+            precision.append(painted[is_paint & (target != IGNORE)].mean())
         for row, column in np.ndindex(3, 3):
-            overlap[row, column] += (np.roll(found, (row - 1, column - 1), (0, 1)) & painted).sum()
+            overlap[row, column] += (np.roll(is_paint, (row - 1, column - 1), (0, 1)) & painted).sum()
     assert np.median(recall) > 0.85
     assert np.median(precision) > 0.85
     for before, here, after in (overlap[:, 1], overlap[1]):

@@ -86,8 +86,8 @@ def texts() -> Iterator[Case]:
             # Of intrinsics any tool's file will do.
             either = f"{says}|no intrinsics of a known format" if file.startswith("front") else says
             yield checked(f"{file}: {name}", either, write(file, text))
-        both = ("a.yaml", "a.yaml")
-        yield Case(f"calibration: {name}", "v2hdm calibrate compare", both, write("a.yaml", text), says)
+        names = ("a.yaml", "a.yaml")
+        yield Case(f"calibration: {name}", "v2hdm calibrate compare", names, write("a.yaml", text), says)
     for name, (text, says) in JSON_TEXTS.items():
         yield exported(f"map: {name}", write("map.geojson", text), says)
     for file in ("drive.yaml", "poses.tum", "front/camera_info.yaml", "front/images.txt"):
@@ -222,7 +222,7 @@ def fields() -> Iterator[Case]:
     right = {"linear_response": (True,), "initial_ipm": (None,), "centre_prior": (None,)}
     for key in front:
         for value in wrong:
-            if any(value is one for one in right.get(key, ())):
+            if any(value is right_value for right_value in right.get(key, ())):
                 continue
 
             def change(content: dict, key: str = key, value: object = value) -> None:

@@ -82,26 +82,26 @@ class Outcome:
 
     def faults(self, case: Case) -> list[str]:
         """Forbidden acts of the door."""
-        told = [line for line in self.error.splitlines() if line.startswith("error: ")]
-        found = []
+        lines = [line for line in self.error.splitlines() if line.startswith("error: ")]
+        defects = []
         if self.code != case.code:
-            found.append(f"exit code {self.code}, not {case.code}")
+            defects.append(f"exit code {self.code}, not {case.code}")
         if "Traceback" in self.error or "Error:" in self.error.replace("error:", ""):
-            found.append("a traceback")
-        if case.code == 2 and len(told) != 1:
-            found.append(f"{len(told)} lines of error")
-        text = f"{self.error}\n{self.output}" if case.tells else "\n".join(told)
+            defects.append("a traceback")
+        if case.code == 2 and len(lines) != 1:
+            defects.append(f"{len(lines)} lines of error")
+        text = f"{self.error}\n{self.output}" if case.tells else "\n".join(lines)
         if not re.search(case.says, text):
-            found.append(f"does not say {case.says!r}")
-        if re.search(r"<class |object at 0x|None\b|\bdtype|array\(", "\n".join(told)):
-            found.append("speaks Python")
+            defects.append(f"does not say {case.says!r}")
+        if re.search(r"<class |object at 0x|None\b|\bdtype|array\(", "\n".join(lines)):
+            defects.append("speaks Python")
         changed = [name for name, digest in self.before.items() if self.after.get(name) != digest]
         if changed:
-            found.append(f"changed or removed {changed}")
+            defects.append(f"changed or removed {changed}")
         new = [name for name in self.after if name not in self.before and not re.search(case.leaves, name)]
         if new:
-            found.append(f"left {new}")
-        return found
+            defects.append(f"left {new}")
+        return defects
 
 
 def judge(case: Case, folder: Path, run: Callable[[Case], Ran] | None = None) -> Outcome:
@@ -158,12 +158,12 @@ def run_here(case: Case) -> Ran:
 
 @contextlib.contextmanager
 def _in_folder(folder: Path) -> Iterator[None]:
-    given = Path.cwd()
+    folder_before = Path.cwd()
     os.chdir(folder)
     try:
         yield
     finally:
-        os.chdir(given)
+        os.chdir(folder_before)
 
 
 @contextlib.contextmanager
@@ -175,7 +175,7 @@ def _in_time() -> Iterator[None]:
         (signal.SIGALRM, signal.ITIMER_REAL, LONGEST_WAIT_S),
         (signal.SIGPROF, signal.ITIMER_PROF, LONGEST_S),
     )
-    given = {number: signal.signal(number, stop) for number, _, _ in limits}
+    handlers = {number: signal.signal(number, stop) for number, _, _ in limits}
     for _, timer, most_s in limits:
         signal.setitimer(timer, most_s)
     try:
@@ -183,7 +183,7 @@ def _in_time() -> Iterator[None]:
     finally:
         for number, timer, _ in limits:
             signal.setitimer(timer, 0)
-            signal.signal(number, given[number])
+            signal.signal(number, handlers[number])
 
 
 @contextlib.contextmanager
@@ -202,18 +202,18 @@ def full_disk(most: int | None) -> Iterator[None]:
 
 def state_of(folder: Path) -> dict[str, str]:
     """Kind and content of everything in a folder."""
-    found = {}
+    states = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if path.is_symlink():
-            found[name] = f"link {path.readlink()}"
+            states[name] = f"link {path.readlink()}"
         elif path.is_dir():
-            found[name] = "folder"
+            states[name] = "folder"
         elif path.is_file():
             data = path.read_bytes()
             # A GeoPackage must have the date on which it was written.
             data = DATE.sub(b"", data) if path.suffix == ".gpkg" else data
-            found[name] = hashlib.sha256(data).hexdigest()
+            states[name] = hashlib.sha256(data).hexdigest()
         else:
-            found[name] = "special"
-    return found
+            states[name] = "special"
+    return states

@@ -51,9 +51,11 @@ MAKERS = {
 def owners() -> Iterator[Case]:
     """Outputs onto what somebody else has made, or the command reads."""
     for command, line in COMMANDS.items():
-        for name, made in MAKERS.items():
-            own = made.format(command=command)
-            prepare = _site(lambda root, own=own: _result(root / "out", own))
+        for name, maker in MAKERS.items():
+            maker_of_command = maker.format(command=command)
+            prepare = _site(
+                lambda root, maker_of_command=maker_of_command: _result(root / "out", maker_of_command)
+            )
             says = "holds a result of .*: move it"
             yield Case(f"{command} over the result of {name}", command, line.split(), prepare, says)
     line = "out/map.geojson drive --workers 1 --output out"
@@ -149,8 +151,8 @@ def _calibrated(folder: Path) -> None:
     write_calibration(Calibration(INFO, mounting()), folder / "calibration_front.yaml")
 
 
-def _result(folder: Path, made: str) -> None:
-    with result_folder(folder, maker=made) as partial:
+def _result(folder: Path, maker_of_result: str) -> None:
+    with result_folder(folder, maker=maker_of_result) as partial:
         write_geojson(make_map(), partial / "map.geojson")
         _calibrated(partial)
 
@@ -218,8 +220,8 @@ def _twin(path: Path) -> None:
 
 def _listless(path: Path) -> None:
     """The folder of an earlier version, or of the user, which no list names."""
-    for one in path.parents:
-        (one / ".v2hdm-results.jsonl").unlink(missing_ok=True)
+    for folder in path.parents:
+        (folder / ".v2hdm-results.jsonl").unlink(missing_ok=True)
 
 
 HARMS: dict[str, Callable[[Path], None]] = {

@@ -85,12 +85,12 @@ EXPORTS = _plainly("opset=3 opset=99 tolerance=nan int8.frames=0 int8.bounds.kin
 
 def measures(options: object, below: str = "") -> Iterator[str]:
     """The keys of all settings that are numbers with a fraction, also of those that are added later."""
-    for one in fields_of(options):
-        value = getattr(options, one.name)
+    for field in fields_of(options):
+        value = getattr(options, field.name)
         if is_dataclass(value):
-            yield from measures(value, f"{below}{one.name}.")
+            yield from measures(value, f"{below}{field.name}.")
         elif isinstance(value, float):
-            yield below + one.name
+            yield below + field.name
 
 
 SIGNED = ("start_s", "sun_azimuth_deg", "sun_elevation_deg", "moving_offset_m")
@@ -126,7 +126,9 @@ def settings() -> Iterator[Case]:
         yield Case(f"score {line}", "train.score", (line,), both(), says)
     for line, says in EXPORTS.items():
         words = [
-            one for one in ("checkpoint=a.pt", "output=b.onnx") if one.split("=")[0] != line.split("=")[0]
+            setting
+            for setting in ("checkpoint=a.pt", "output=b.onnx")
+            if setting.split("=")[0] != line.split("=")[0]
         ]
         yield Case(f"export {line}", "export.__main__", (*words, line), write("a.pt", "x"), says)
     run = ("drive.path=drive", "--config-dir", "conf", "+run=mine", "workers=1")

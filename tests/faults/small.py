@@ -33,7 +33,7 @@ def small() -> Iterator[Case]:
 
 def entries(**content: object) -> Change:
     """Put entries into ``drive.yaml``."""
-    return described(lambda given: given.update(content))
+    return described(lambda entries_of_drive: entries_of_drive.update(content))
 
 
 ROUTE = {"stamp_s": "100", "x_m": "0", "y_m": "0", "yaw_deg": "0", "sigma_m": ".02"}
@@ -46,8 +46,8 @@ ROUTES = [
     *(("yaw_deg", cell, "yaw_deg|cells under|not a table") for cell in ("x", LONG)),
     *(("sigma_m", cell, "no position is known") for cell in ("inf", "1e300", "0.2")),
 ]  # fmt: skip
-OPEN = {"x_m": "positions that are no numbers", "stamp_s": "lines without a time"}
-OPEN |= {"yaw_deg": "headings that are no numbers"}
+OPEN = {"x_m": "positions that are not numbers", "stamp_s": "lines without a time"}
+OPEN |= {"yaw_deg": "headings that are not numbers"}
 
 
 def _routes() -> Iterator[Case]:
@@ -57,9 +57,9 @@ def _routes() -> Iterator[Case]:
             rows[-1][column] = cell
             text = "\n".join(",".join(row.values()) for row in (dict(zip(ROUTE, ROUTE, strict=True)), *rows))
             changes = entries(poses={"csv": "route.csv"}), write("route.csv", text)
-            told = f"left out 1 of 20 {says}"
+            warning = f"left out 1 of 20 {says}"
             more = {"code": 0, "leaves": "/out(/|$)", "tells": True}
-            yield checked(f"route: {column} {cell[:9]}", told, *changes, **more)
+            yield checked(f"route: {column} {cell[:9]}", warning, *changes, **more)
     for column, cell, says in ROUTES:
         lines = [ROUTE | {"stamp_s": f"{100 + k / 10:.1f}", "x_m": str(k)} for k in range(20)]
         wrong = range(20) if "known" in says else [19]
@@ -76,8 +76,8 @@ LOGS = {
     "no sentence": "words\n" * 9,
     "sentences without checksums that are cut off": "$GNGGA,1200\n" * 9,
     "wrong checksums": "$GNGGA,120000.00,5330.0,N,00957.0,E,4,12,0.8,4.0,M,40.5,M,1.0,0000*00\n" * 9,
-    "negative sigmas": "".join(f"${GST.format(one, one)}\n" for one in NO_SIGMAS),
-    "sigmas that are not known": "".join(f"${GST.format(one, one)}\n" for one in ("nan", "", "x")),
+    "negative sigmas": "".join(f"${GST.format(sigma, sigma)}\n" for sigma in NO_SIGMAS),
+    "sigmas that are not known": "".join(f"${GST.format(sigma, sigma)}\n" for sigma in ("nan", "", "x")),
     "a sentence of 200000 digits": f"${GST.format(LONG, LONG)}\n",
     "bytes that do not show": "\x1b[2J\x07$\x1b\n" * 9,
 }
@@ -100,10 +100,10 @@ def _urls() -> Iterator[Case]:
             "roi_vehicle": [[3, -3], [9, -3], [9, 3], [3, 3]],
             "mounting": {"height_m": 2, "pitch_deg": 0},
         }
-        own = {"images": "front/images.txt", "camera_info": "front/camera_info.yaml"}
+        camera = {"images": "front/images.txt", "camera_info": "front/camera_info.yaml"}
         for key, value in {"images": url, "camera_info": url, "video": url}.items():
             named = {"images": {"video": value, "start_s": 0}} if key == "video" else {key: value}
-            changed = entries(cameras={"front": front | own | named})
+            changed = entries(cameras={"front": front | camera | named})
             yield checked(f"{key} at {url}", "no such|not readable|cannot be read|missing", changed)
         for key in ("poses", "truth"):
             yield checked(f"{key} at {url}", "no such|cannot be read|not a", entries(**{key: url}))
@@ -111,9 +111,29 @@ def _urls() -> Iterator[Case]:
 
 def _maps() -> Iterator[Case]:
     """Sigmas, shares and accuracies of a map, of the first feature that may have them."""
-    one: tuple[object, ...] = (-1, -1e-9, "x", True, [], {}, [[1]], 10**400, float("nan"), float("-inf"))
-    each: tuple[object, ...] = ([-0.01] * 4, [0.01] * 3, ["x"] * 4, [float("nan")] * 4, 7, "x", {}, [[1]] * 4)
-    for key, values in {"relative_sigma_m": one, "heights_sigma_m": each}.items():
+    wrong_numbers: tuple[object, ...] = (
+        -1,
+        -1e-9,
+        "x",
+        True,
+        [],
+        {},
+        [[1]],
+        10**400,
+        float("nan"),
+        float("-inf"),
+    )
+    wrong_lists: tuple[object, ...] = (
+        [-0.01] * 4,
+        [0.01] * 3,
+        ["x"] * 4,
+        [float("nan")] * 4,
+        7,
+        "x",
+        {},
+        [[1]] * 4,
+    )
+    for key, values in {"relative_sigma_m": wrong_numbers, "heights_sigma_m": wrong_lists}.items():
         for value in values:
             yield _map_with(f"{key} {json.dumps(value)[:12]}", "Polygon", {key: value}, key)
     for value in ("D", "a", "", 1, True, [], ["A"], {}):
@@ -129,7 +149,7 @@ def _map_with(name: str, shape: str, properties: dict[str, object], says: str) -
     def prepare(root: Path) -> None:
         write_geojson(make_map(), root / "map.geojson")
         content = json.loads((root / "map.geojson").read_text())
-        feature = next(one for one in content["features"] if one["geometry"]["type"] == shape)
+        feature = next(feature for feature in content["features"] if feature["geometry"]["type"] == shape)
         feature["properties"].update(properties)
         (root / "map.geojson").write_text(json.dumps(content))
 
@@ -192,17 +212,17 @@ def _bag(name: str, says: str, change: Callable[[object], object], topic: str) -
     """A bag whose last message of a topic is changed."""
 
     def prepare(root: Path) -> None:
-        made = replace(_messages(), rows=list(_messages().rows))
-        number = max(n for n, row in enumerate(made.rows) if row[1] == topic)
-        made.rows[number] = (*made.rows[number][:2], change(made.rows[number][2]))
-        _described(root, made)
+        messages = replace(_messages(), rows=list(_messages().rows))
+        number = max(n for n, row in enumerate(messages.rows) if row[1] == topic)
+        messages.rows[number] = (*messages.rows[number][:2], change(messages.rows[number][2]))
+        _described(root, messages)
 
     return Case(f"bag: {name}", CHECK, CHECKED, prepare, says, leaves="^work/here/cache(/|$)")
 
 
-def _described(root: Path, made: Messages) -> Path:
+def _described(root: Path, messages: Messages) -> Path:
     write_example(root / "drive")
-    bag = write_ros2(root / "bag", made, StoragePlugin.SQLITE3)
+    bag = write_ros2(root / "bag", messages, StoragePlugin.SQLITE3)
     (root / "drive" / "drive.yaml").write_text(yaml.safe_dump(topics_for(root / "drive", bag)))
     return next(bag.glob("*.db3"))
 
@@ -213,20 +233,20 @@ STAMPS = ("'noon'", "X'ff'")
 def _bags() -> Iterator[Case]:
     info, other = "/sensing/front/camera_info", r"message \d+ has another lens than the first"
     for name, change in {
-        "another focal length": lambda one: replace(one, k=one.k * [1.5, 1, 1, 1, 1.5, 1, 1, 1, 1]),
-        "a focal length that is not finite": lambda one: replace(one, k=one.k * np.nan),
-        "another size": lambda one: replace(one, width=2 * one.width),
-        "another distortion": lambda one: replace(one, d=one.d + 0.1),
-        "no distortion": lambda one: replace(one, d=one.d[:0]),
+        "another focal length": lambda info: replace(info, k=info.k * [1.5, 1, 1, 1, 1.5, 1, 1, 1, 1]),
+        "a focal length that is not finite": lambda info: replace(info, k=info.k * np.nan),
+        "another size": lambda info: replace(info, width=2 * info.width),
+        "another distortion": lambda info: replace(info, d=info.d + 0.1),
+        "no distortion": lambda info: replace(info, d=info.d[:0]),
     }.items():
         yield _bag(f"{name} at the end", other, change, info)
     for at in (0, 7, 35):
         for value in (-0.5, -1e-9, -np.inf):
 
-            def turn(one: object, at: int = at, value: float = value) -> object:
-                covariance = one.pose.covariance.copy()  # type: ignore[attr-defined]
+            def turn(message: object, at: int = at, value: float = value) -> object:
+                covariance = message.pose.covariance.copy()  # type: ignore[attr-defined]
                 covariance[at] = value
-                return replace(one, pose=replace(one.pose, covariance=covariance))  # type: ignore
+                return replace(message, pose=replace(message.pose, covariance=covariance))  # type: ignore
 
             yield _bag(f"covariance {value} at {at}", "a negative variance", turn, "/odom")
     for value in STAMPS:

@@ -44,8 +44,8 @@ def test_the_judge_sees_what_a_command_may_not_do(tmp_path):
 
     case = Case("a", "v2hdm check", (), lambda root: None, "a cause")
     faults = " ".join(judge(case, tmp_path, run).faults(case))
-    for one in ("code 1", "traceback", "0 lines", "does not say", "changed or removed", "left"):
-        assert one in faults
+    for words in ("code 1", "traceback", "0 lines", "does not say", "changed or removed", "left"):
+        assert words in faults
 
 
 CORPUS = Path(__file__).with_name("corpus.tar.xz")
@@ -53,12 +53,12 @@ CORPUS = Path(__file__).with_name("corpus.tar.xz")
 
 def inputs():
     """By reader."""
-    found: dict[str, list[bytes]] = {}
+    members: dict[str, list[bytes]] = {}
     with tarfile.open(CORPUS) as archive:
         for member in archive:
             stream = archive.extractfile(member)
-            found.setdefault(member.name.split("/")[0], []).append(stream.read())
-    return found
+            members.setdefault(member.name.split("/")[0], []).append(stream.read())
+    return members
 
 
 INPUTS = inputs()
@@ -86,10 +86,10 @@ PLAIN = st.recursive(
 def test_what_yaml_writes_of_plain_values_is_read_as_it_was(content):
     try:
         text = yaml.safe_dump(content, allow_unicode=True)
-        known = yaml.safe_load(text) == content
+        is_known = yaml.safe_load(text) == content
     except yaml.YAMLError:
-        known = False
-    if known:
+        is_known = False
+    if is_known:
         assert parse_yaml(text, "here", DriveError) == content
 
 

@@ -52,12 +52,12 @@ def test_a_door_on_a_failing_disk_does_all_or_tells_and_works_afterwards(situati
 def test_a_mosaic_on_a_failing_disk_is_whole_or_not_there(tmp_path):
     pytest.importorskip("rasterio", reason="no rasterio: pip install 'v2hdm[gis]'")
     canvas = Canvas(np.zeros(2), 0.02, 512, 512)
-    seen = np.random.default_rng(0).integers(0, 255, (512, 512, 4), dtype=np.uint8)
+    pixels = np.random.default_rng(0).integers(0, 255, (512, 512, 4), dtype=np.uint8)
 
     def write():
         try:
             with geotiff(tmp_path / "a.tif", canvas, None) as put:
-                put(Sheet(0, 0, seen))
+                put(Sheet(0, 0, pixels))
         except OSError:
             return 2
         return 0

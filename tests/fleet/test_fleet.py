@@ -31,12 +31,12 @@ def test_results_at_an_object_store_are_those_of_a_folder(s3, drive, alone, tmp_
     settings = ["output=s3://bucket/results", f"cache={tmp_path / 'cache'}", "workers=1"]
     (job,) = plan([written(tmp_path, "good", drive)], settings).jobs
     assert job.place == "s3://bucket/results/good"
-    for kept in (False, True):
+    for is_kept in (False, True):
         result, taken = take_or_run(job.config, job.config_yaml, lambda *_: None)
-        assert (result.place, taken) == (job.place, kept)
+        assert (result.place, taken) == (job.place, is_kept)
     for name in ("map.geojson", "calibration_front.yaml"):
-        there = s3.get_object(Bucket="bucket", Key=f"results/good/{name}")["Body"].read()
-        assert there == (alone / name).read_bytes()
+        content = s3.get_object(Bucket="bucket", Key=f"results/good/{name}")["Body"].read()
+        assert content == (alone / name).read_bytes()
 
 
 @pytest.mark.slow
@@ -47,11 +47,11 @@ def test_a_fleet_outlives_its_processes_keeps_what_is_finished_and_goes_on_past_
     doomed, typo = written(tmp_path, "doomed", drive), written(tmp_path, "typo", drive)
     typo.write_text(typo.read_text() + "mapping: {max_rang_m: 3}\n")
     overrides = [f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}"]
-    told: list[tuple[str, str, int, int]] = []
+    messages: list[tuple[str, str, int, int]] = []
     killed: list[str] = []
 
     def kills(*message):
-        told.append(message)
+        messages.append(message)
         if message[1] in ("check", "detect") and (message[0] == "doomed" or "good" not in killed):
             killed.append(message[0])
             (process,) = multiprocessing.active_children()
@@ -68,7 +68,7 @@ def test_a_fleet_outlives_its_processes_keeps_what_is_finished_and_goes_on_past_
     assert "no such drive folder" in rows[1].says
     assert "died twice over the same work" in rows[2].says
     assert re.search("did you mean .*mapping.max_range_m", rows[3].says)
-    assert ("good", "detect", images, images) in told
+    assert ("good", "detect", images, images) in messages
     table = list(csv.DictReader(StringIO((tmp_path / "table" / "fleet.csv").read_text())))
     assert [row["drive"] for row in table] == ["good", "nowhere", "doomed", "typo"]
     assert json.loads((tmp_path / "table" / "fleet.json").read_text())["drives"][0]["status"] == "PASS"
@@ -85,11 +85,11 @@ def test_a_fleet_that_is_ended_takes_its_processes_with_it(end, drive, tmp_path)
     arguments = [str(file), f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}", "--workers", "1"]
     command = [sys.executable, "-m", "v2hdm", "fleet", *arguments, "--table", str(tmp_path / "table")]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    begun = subprocess.Popen(command, cwd=ROOT, **pipes)
-    assert begun.stdout.readline().startswith("good: check")  # a process is at work
-    os.kill(begun.pid, end)
-    _, errors = begun.communicate(timeout=60)  # returns when the last process has closed its end
-    assert (begun.returncode, errors[:18]) in [(2, "error: interrupted"), (-9, "")], errors
+    process = subprocess.Popen(command, cwd=ROOT, **pipes)
+    assert process.stdout.readline().startswith("good: check")  # a process is at work
+    os.kill(process.pid, end)
+    _, errors = process.communicate(timeout=60)  # returns when the last process has closed its end
+    assert (process.returncode, errors[:18]) in [(2, "error: interrupted"), (-9, "")], errors
     assert errors.count("\n") == (end == signal.SIGTERM)
     assert not list((tmp_path / "out").glob("*"))
 
@@ -104,8 +104,14 @@ def test_two_run_files_never_write_one_folder(tmp_path, drive):
 
 @pytest.mark.parametrize("files", [["TYPO/*.yaml"], ["TYPO/a.yaml", "TYPO/b.yaml"], []])
 def test_a_fleet_without_a_run_file_is_an_error(files, capsys, tmp_path):
-    given = ["fleet", *(f"{tmp_path}/{file}" for file in files), "output=x", "--table", str(tmp_path / "t")]
-    assert command(given) == 2
+    arguments = [
+        "fleet",
+        *(f"{tmp_path}/{file}" for file in files),
+        "output=x",
+        "--table",
+        str(tmp_path / "t"),
+    ]
+    assert command(arguments) == 2
     problem = "no such run file; check the path" if files else "no drives given: name run files"
     assert problem in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
@@ -121,8 +127,8 @@ def test_run_files_that_name_different_clusters_are_refused(tmp_path, drive):
 def test_a_fleet_on_a_cluster_that_is_not_there_is_one_line(capsys, tmp_path, drive, monkeypatch):
     monkeypatch.setattr("v2hdm.executor.connecting._CONNECT_S", 1.0)
     file = written(tmp_path, "a", drive)
-    given = ["fleet", str(file), "--cluster", "tcp://127.0.0.1:9", "--table", str(tmp_path / "table")]
-    assert command(given) == 2
+    arguments = ["fleet", str(file), "--cluster", "tcp://127.0.0.1:9", "--table", str(tmp_path / "table")]
+    assert command(arguments) == 2
     assert re.fullmatch(
         r"error: cluster=tcp://127.0.0.1:9: no Dask scheduler answers .*\n", capsys.readouterr().err
     )

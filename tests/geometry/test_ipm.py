@@ -49,22 +49,22 @@ def test_the_extrinsic_comes_back_from_its_ipm_whatever_its_scale_and_sign(facto
 def test_an_inexact_ipm_yields_the_rigid_camera_above_the_ground_whose_columns_are_nearest():
     rng = np.random.default_rng(0)
     ipm = ipm_from_extrinsic(INFO, MOUNTS[0]) * (1 + 0.02 * rng.normal(size=(3, 3)))
-    found = extrinsic_from_ipm(INFO, ipm)
-    np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(found[:3, :3]) == pytest.approx(1)
-    assert camera_centre(found)[2] > 0
+    cam_from_vehicle = extrinsic_from_ipm(INFO, ipm)
+    np.testing.assert_allclose(cam_from_vehicle[:3, :3] @ cam_from_vehicle[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(cam_from_vehicle[:3, :3]) == pytest.approx(1)
+    assert camera_centre(cam_from_vehicle)[2] > 0
     columns = np.linalg.solve(INFO.intrinsic, np.linalg.inv(ipm))
-    scale = (columns[:, 2] @ found[:3, 3]) / (found[:3, 3] @ found[:3, 3])
+    scale = (columns[:, 2] @ cam_from_vehicle[:3, 3]) / (cam_from_vehicle[:3, 3] @ cam_from_vehicle[:3, 3])
 
     def misfit(matrix, scale):
         return np.linalg.norm(columns[:, :2] / scale - matrix[:3, :2])
 
-    nearest = misfit(found, scale)
+    nearest = misfit(cam_from_vehicle, scale)
     for tangent in rng.normal(0, 1e-3, (20, 6)):
-        assert misfit(exp(tangent * [0, 0, 0, 1, 1, 1]) @ found, scale) > nearest
+        assert misfit(exp(tangent * [0, 0, 0, 1, 1, 1]) @ cam_from_vehicle, scale) > nearest
     assert all(
-        np.linalg.norm(columns[:, :2] - f * scale * found[:3, :2])
-        > np.linalg.norm(columns[:, :2] - scale * found[:3, :2])
+        np.linalg.norm(columns[:, :2] - f * scale * cam_from_vehicle[:3, :2])
+        > np.linalg.norm(columns[:, :2] - scale * cam_from_vehicle[:3, :2])
         for f in (0.99, 1.01)
     )
 
@@ -97,8 +97,8 @@ def test_a_pitch_error_moves_a_point_along_its_ray_as_the_formula_says():
 def test_a_batch_of_cameras_projects_as_each_of_them_does():
     points = np.stack([ROI, ROI * [-1, 1], ROI])
     pixels, depth_m = project_ground(INFO.intrinsic, MOUNTS, points)
-    for mount, own, at, depth in zip(MOUNTS, points, pixels, depth_m, strict=True):
-        single_px, single_m = project_ground(INFO.intrinsic, mount, own)
+    for mount, points_of_camera, at, depth in zip(MOUNTS, points, pixels, depth_m, strict=True):
+        single_px, single_m = project_ground(INFO.intrinsic, mount, points_of_camera)
         np.testing.assert_allclose(at, single_px, rtol=1e-13)
         np.testing.assert_allclose(depth, single_m, rtol=1e-13)
 
@@ -179,28 +179,28 @@ ALL = np.ones(4, dtype=bool)
 @pytest.mark.parametrize("shift", range(4))
 def test_a_cyclic_shift_is_found_and_undone(shift):
     turned = np.roll(DIAMOND, shift, axis=0) + OFFSET
-    found = align(DIAMOND, ALL, turned, ALL)
-    assert found.shift == shift
-    np.testing.assert_allclose(found.offset, OFFSET)
-    np.testing.assert_allclose(turned[(np.arange(4) + found.shift) % 4], DIAMOND + OFFSET)
-    assert found.deformation_m == pytest.approx(0.0, abs=1e-12)
+    aligned = align(DIAMOND, ALL, turned, ALL)
+    assert aligned.shift == shift
+    np.testing.assert_allclose(aligned.offset, OFFSET)
+    np.testing.assert_allclose(turned[(np.arange(4) + aligned.shift) % 4], DIAMOND + OFFSET)
+    assert aligned.deformation_m == pytest.approx(0.0, abs=1e-12)
 
 
 def test_corners_that_are_not_valid_take_no_part_and_another_shape_shows_as_deformation():
     broken = DIAMOND.copy()
     broken[2] = np.nan
-    found = align(DIAMOND, ALL, broken, np.array([True, True, False, True]))
-    assert found.shift == 0
-    assert found.deformation_m == pytest.approx(0.0, abs=1e-12)
+    aligned = align(DIAMOND, ALL, broken, np.array([True, True, False, True]))
+    assert aligned.shift == 0
+    assert aligned.deformation_m == pytest.approx(0.0, abs=1e-12)
     assert np.isinf(align(DIAMOND, ALL, DIAMOND, np.array([True, False, False, False])).deformation_m)
     assert align(DIAMOND, ALL, 1.5 * DIAMOND, ALL).deformation_m == pytest.approx(0.3)
 
 
 def test_alignment_broadcasts_over_tracks_and_detections():
     tracks = np.stack([DIAMOND, DIAMOND + 5.0, DIAMOND - 3.0])[:, None]
-    found = align(tracks, np.ones((3, 1, 4), bool), np.stack([DIAMOND] * 2), np.ones((2, 4), bool))
-    assert found.shift.shape == (3, 2)
-    np.testing.assert_allclose(found.offset[:, 0, 0], [0.0, -5.0, 3.0], atol=1e-12)
+    aligned = align(tracks, np.ones((3, 1, 4), bool), np.stack([DIAMOND] * 2), np.ones((2, 4), bool))
+    assert aligned.shift.shape == (3, 2)
+    np.testing.assert_allclose(aligned.offset[:, 0, 0], [0.0, -5.0, 3.0], atol=1e-12)
 
 
 def test_area_sense_and_diameter_of_a_diamond_and_of_its_image_whose_second_axis_turns_down():
@@ -232,8 +232,8 @@ def test_the_width_of_a_bar_is_its_breadth():
 def test_a_quadrilateral_is_found_again_from_points_on_its_outline():
     along = np.linspace(0, 1, 40, endpoint=False)[:, None]
     outline = np.concatenate([KITE[e] * (1 - along) + KITE[(e + 1) % 4] * along for e in range(4)])
-    found = quad_from_hull(cv2.convexHull(outline.astype(np.float32)))
-    distance = np.linalg.norm(found[:, None] - KITE, axis=-1).min(axis=1)
+    quad = quad_from_hull(cv2.convexHull(outline.astype(np.float32)))
+    distance = np.linalg.norm(quad[:, None] - KITE, axis=-1).min(axis=1)
     assert distance.max() < 0.05
 
 

@@ -12,12 +12,12 @@ AT = np.linspace(0.0, 2.0, 30)
 TRUE = np.array([1.5, -0.8])
 
 
-def curve(x, seen, weight=None):
+def curve(x, measured, weight=None):
     """``seen`` (30,) as a exp(b t), in standard deviations of .01."""
     grown = np.exp(x[1] * AT)
     slopes = np.stack([grown, x[0] * AT * grown], axis=1)
     weights = 1e4 * (np.ones(30) if weight is None else weight)
-    return normal_equations((x[0] * grown - seen)[:, None], slopes[:, None], weights[:, None, None])
+    return normal_equations((x[0] * grown - measured)[:, None], slopes[:, None], weights[:, None, None])
 
 
 def noisy(seed):
@@ -25,7 +25,7 @@ def noisy(seed):
 
 
 def test_a_curve_is_recovered_and_its_sigmas_hold():
-    fits = [gauss_newton(partial(curve, seen=noisy(seed)), np.array([1.0, 0.0])) for seed in range(200)]
+    fits = [gauss_newton(partial(curve, measured=noisy(seed)), np.array([1.0, 0.0])) for seed in range(200)]
     assert all(fit.converged for fit in fits)
     squares = [(fit.x - TRUE) @ np.linalg.solve(fit.covariance, fit.x - TRUE) for fit in fits]
     assert np.mean(squares) == pytest.approx(2.0, abs=0.45)  # three deviations of a mean of 200
@@ -42,14 +42,14 @@ def test_what_nothing_observes_stays_where_it_was_and_has_no_finite_sigma():
 
 
 def test_robust_weights_leave_outliers_aside():
-    seen = noisy(1)
-    seen[::6] += 3.0
+    measured = noisy(1)
+    measured[::6] += 3.0
 
     def linearise(x):
-        off = (x[0] * np.exp(x[1] * AT) - seen) / 0.01
-        return curve(x, seen, 1 / (1 + (off / 2.5) ** 2))
+        off = (x[0] * np.exp(x[1] * AT) - measured) / 0.01
+        return curve(x, measured, 1 / (1 + (off / 2.5) ** 2))
 
-    assert np.abs(gauss_newton(lambda x: curve(x, seen), TRUE).x - TRUE).max() > 0.1
+    assert np.abs(gauss_newton(lambda x: curve(x, measured), TRUE).x - TRUE).max() > 0.1
     assert np.abs(gauss_newton(linearise, TRUE, steps=100).x - TRUE).max() < 0.02
 
 

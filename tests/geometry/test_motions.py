@@ -41,7 +41,9 @@ def test_exp_agrees_with_the_matrix_exponential_and_with_kornia(angle):
     tangent[:, 3:] *= angle / np.linalg.norm(tangent[:, 3:], axis=1, keepdims=True)
     generator = np.zeros((4, 4, 4))
     generator[:, :3, :3], generator[:, :3, 3] = rigid.hat(tangent[:, 3:]), tangent[:, :3]
-    np.testing.assert_allclose(rigid.exp(tangent), np.stack([expm(one) for one in generator]), atol=1e-12)
+    np.testing.assert_allclose(
+        rigid.exp(tangent), np.stack([expm(matrix) for matrix in generator]), atol=1e-12
+    )
     agree(rigid.exp(tangent), Se3.exp(torch.as_tensor(tangent)).matrix(), atol=1e-12)
     np.testing.assert_allclose(rigid.log(rigid.exp(tangent)), tangent, atol=1e-9)
 
@@ -114,9 +116,12 @@ def test_ground_points_and_their_derivatives_agree_below_the_horizon_and_are_nan
     points, jacobian = tensors.back_project_with_jacobian(*as_torch)
     expected = ipm.apply_in_front(homographies, pixels)
     assert 0.1 < np.isnan(expected[..., 0]).mean() < 0.9
-    near = np.isnan(expected) | (np.abs(expected) < 100)
-    agree(np.where(near, expected, 0), torch.where(torch.as_tensor(near), points, 0.0))
-    agree(np.where(near, expected, 0), torch.where(torch.as_tensor(near), tensors.back_project(*as_torch), 0))
+    is_near = np.isnan(expected) | (np.abs(expected) < 100)
+    agree(np.where(is_near, expected, 0), torch.where(torch.as_tensor(is_near), points, 0.0))
+    agree(
+        np.where(is_near, expected, 0),
+        torch.where(torch.as_tensor(is_near), tensors.back_project(*as_torch), 0),
+    )
     agree(ipm.homography_jacobian(homographies, pixels), jacobian)
 
 

@@ -45,8 +45,8 @@ def test_a_single_pose_stands_still():
 
 def test_a_poses_own_error_has_hardly_a_part_in_its_twist():
     response = response_of_speed()
-    own = np.abs(IN_TURN_S - IN_TURN_S[MIDDLE]) < 0.05
-    assert np.abs(response[own]).max() < 0.05  # 1 / s; the difference of the neighbours has 8
+    is_same_pose = np.abs(IN_TURN_S - IN_TURN_S[MIDDLE]) < 0.05
+    assert np.abs(response[is_same_pose]).max() < 0.05  # 1 / s; the difference of the neighbours has 8
 
 
 def test_white_errors_of_poses_average_out_in_a_twist():

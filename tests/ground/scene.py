@@ -48,7 +48,7 @@ def path(turn_deg: float, length_m: float = 30.0) -> Trajectory:
     steps = np.diff(fine, prepend=0.0)
     x, y = np.cumsum(steps * np.cos(yaw)), np.cumsum(steps * np.sin(yaw))
     along = at * _SPEED_MPS
-    return Trajectory(at, level(*(np.interp(along, fine, one) for one in (x, y, yaw))))
+    return Trajectory(at, level(*(np.interp(along, fine, coordinate) for coordinate in (x, y, yaw))))
 
 
 def make_drive(
@@ -75,8 +75,8 @@ def make_drive(
     images = []
     for k, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
         file = folder / "front" / f"{k:03d}.png"
-        seen = _look(floor, rays, pose, height_m)
-        noisy = np.clip(seen + rng.normal(0.0, grain, seen.shape), 0, 255).astype(np.uint8)
+        grey = _look(floor, rays, pose, height_m)
+        noisy = np.clip(grey + rng.normal(0.0, grain, grey.shape), 0, 255).astype(np.uint8)
         cv2.imwrite(str(file), noisy, [cv2.IMWRITE_PNG_COMPRESSION, 1])
         images.append(Image("front", float(stamp), file, pose))
     camera = Camera(

@@ -38,17 +38,17 @@ def straight(tmp_path_factory):
     return make_drive(tmp_path_factory.mktemp("straight"), 0.0, TRUE)
 
 
-def angles_off_deg(found):
-    return np.rad2deg(mounting_angles(found) - mounting_angles(TRUE))
+def angles_off_deg(cam_from_vehicle):
+    return np.rad2deg(mounting_angles(cam_from_vehicle) - mounting_angles(TRUE))
 
 
 def test_true_poses_give_the_true_mounting_from_a_guess_that_is_4_degrees_off(turning):
     guessed = with_guess(turning, extrinsic(roll_deg=-3.0, pitch_deg=24.0, yaw_deg=3.0))
     estimate = estimate_ground(guessed, "front", FEW)
     assert estimate.status is GroundStatus.FOUND
-    found = estimate.calibration.cam_from_vehicle
-    assert np.abs(angles_off_deg(found)).max() < 0.05
-    assert np.abs(-found[:3, :3].T @ found[:3, 3] - CENTRE)[2] < 0.01
+    cam_from_vehicle = estimate.calibration.cam_from_vehicle
+    assert np.abs(angles_off_deg(cam_from_vehicle)).max() < 0.05
+    assert np.abs(-cam_from_vehicle[:3, :3].T @ cam_from_vehicle[:3, 3] - CENTRE)[2] < 0.01
     assert estimate.median_residual < 0.5
 
 
@@ -74,10 +74,10 @@ def test_a_clock_that_is_freed_where_hardly_anything_tells_it_stays_near_its_sta
     poses[:, :2, 3] += rng.normal(0.0, 0.01, (len(poses), 2))
     rough = with_trajectory(straight, replace(straight.trajectory, map_from_vehicle=poses))
     guessed = with_guess(rough, extrinsic(roll_deg=-0.5, pitch_deg=21.0, yaw_deg=0.5))
-    found = estimate_ground(guessed, "front", replace(FEW, free=("clock_s",)))
-    assert found.status is GroundStatus.FOUND
-    assert abs(found.parameters["clock_s"].value) < 0.4
-    assert np.abs(angles_off_deg(found.calibration.cam_from_vehicle))[2] < 0.3
+    with_clock = estimate_ground(guessed, "front", replace(FEW, free=("clock_s",)))
+    assert with_clock.status is GroundStatus.FOUND
+    assert abs(with_clock.parameters["clock_s"].value) < 0.4
+    assert np.abs(angles_off_deg(with_clock.calibration.cam_from_vehicle))[2] < 0.3
 
 
 def test_poses_that_rise_over_the_ground_are_told(straight):
@@ -114,8 +114,8 @@ def test_the_focal_length_of_an_exact_lens_is_right_within_its_sigma(tmp_path, t
 @pytest.mark.parametrize("turn_deg", [0.0, 70.0])
 def test_a_crown_beneath_the_vehicle_is_not_taken_for_a_bent_lens(tmp_path, turn_deg):
     drive = make_drive(tmp_path, turn_deg, TRUE, crown=0.03)
-    found = estimate_ground(drive, "front", replace(FEW, free=("distortion_k1",)))
-    bent, mounting = found.parameters["distortion_k1"], found.calibration.cam_from_vehicle
+    estimate = estimate_ground(drive, "front", replace(FEW, free=("distortion_k1",)))
+    bent, mounting = estimate.parameters["distortion_k1"], estimate.calibration.cam_from_vehicle
     assert abs(bent.value) < 0.015
     assert np.abs(-mounting[:3, :3].T @ mounting[:3, 3] - CENTRE)[2] < 0.03
 
@@ -150,9 +150,9 @@ def test_a_mirrored_world_is_told_from_the_one_as_given(turning):
     zero = np.zeros(len(yaw))
     poses[:, :3, :3] = rotation_from_euler(zero, zero, yaw)
     mirrored = with_trajectory(turning, Trajectory(turning.trajectory.stamp_s, poses))
-    given = estimate_ground(turning, "front", replace(FEW, readings=True))
+    straight_reading = estimate_ground(turning, "front", replace(FEW, readings=True))
     swapped = estimate_ground(mirrored, "front", replace(FEW, readings=True))
-    assert given.reading is Reading.AS_GIVEN
+    assert straight_reading.reading is Reading.AS_GIVEN
     assert swapped.shares[Reading.MIRRORED] > 1.3 * swapped.shares[Reading.AS_GIVEN]
 
 
@@ -210,10 +210,10 @@ def test_dirt_on_a_lens_over_a_floor_without_texture_contradicts_nothing(tmp_pat
 
 
 def test_the_mapper_starts_from_the_ground_only_where_it_was_found(straight, tmp_path):
-    found = estimate_ground(straight, "front", FEW)
-    started = better_start(straight, {"front": found}).cameras["front"]
+    estimate = estimate_ground(straight, "front", FEW)
+    started = better_start(straight, {"front": estimate}).cameras["front"]
     assert started.initial_ipm == "ground"
-    nothing = replace(found, status=GroundStatus.NO_MATCH, calibration=None)
+    nothing = replace(estimate, status=GroundStatus.NO_MATCH, calibration=None)
     assert better_start(straight, {"front": nothing}).cameras["front"].initial_ipm == "estimated"
 
 
@@ -234,8 +234,8 @@ def test_the_command_writes_a_mounting_and_says_how_good_it_is(tmp_path, capsys)
     assert run(
         ["calibrate", "ground", str(tmp_path / "drive"), "--output", str(output), "--workers", "1"]
     ) in (0, 3)
-    found = read_calibration(output / "calibration_front.yaml")
-    np.testing.assert_allclose(found.cam_from_vehicle[:3, :3], true[:3, :3], atol=0.005)
+    calibration = read_calibration(output / "calibration_front.yaml")
+    np.testing.assert_allclose(calibration.cam_from_vehicle[:3, :3], true[:3, :3], atol=0.005)
     shown = capsys.readouterr().out
     assert shown.startswith("front: roll 0.")
     assert "verdict: " in shown

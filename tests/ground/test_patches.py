@@ -35,8 +35,8 @@ def test_a_box_over_the_border_is_the_mean_of_what_lies_inside():
 
 def test_texture_finer_than_a_cell_averages_out_instead_of_becoming_another_texture():
     mount = Mount.at(SHARP, mounted(np.array([0.0, 0.0, 2.0]), 2.0))
-    near = np.column_stack([np.linspace(6.0, 8.0, 20), np.linspace(-0.5, 0.5, 20)])
-    sheet, _ = Sheet.around(near, np.eye(4), 2, 0.04)
+    points_map = np.column_stack([np.linspace(6.0, 8.0, 20), np.linspace(-0.5, 0.5, 20)])
+    sheet, _ = Sheet.around(points_map, np.eye(4), 2, 0.04)
     grey, in_view = sheet.resample(View(GREY, mount, np.eye(4)))
     assert in_view.all()
     pixels = (900 * 0.04 / 7) * max(900 * 2.0 * 0.04 / 7**2, 1.0)  # that a cell covers, 7 m away

@@ -34,13 +34,13 @@ def street(turn_deg_per_m=0.0):
 def seen_later(scene, later_s):
     """The problem of the scene with images taken ``later_s`` (J,) later than stamped, noise left out."""
     problem = scene.problem
-    seen = problem.observations
+    observations = problem.observations
     pixels = {}
     for share in (0.0, 1.0):
         then = scene.map_from_vehicle @ exp(share * later_s[:, None] * problem.twist_vehicle)
-        cam_from_map = scene.cam_from_vehicle[seen.camera] @ np.linalg.inv(then)[seen.frame]
-        pixels[share] = project(cam_from_map, scene.corners_map[seen.corner])
-    moved = replace(seen, pinhole_px=seen.pinhole_px + pixels[1.0] - pixels[0.0])
+        cam_from_map = scene.cam_from_vehicle[observations.camera] @ np.linalg.inv(then)[observations.frame]
+        pixels[share] = project(cam_from_map, scene.corners_map[observations.corner])
+    moved = replace(observations, pinhole_px=observations.pinhole_px + pixels[1.0] - pixels[0.0])
     return replace(problem, observations=moved)
 
 
@@ -112,11 +112,11 @@ def test_the_clock_of_each_session_errs_by_itself():
     session = np.repeat([0, 1], 30)
     twice = replace(problem, session=session, pose_sigma=(POSES, POSES))
     solution = solve(twice, OPTIONS)
-    first, both = (
+    first, of_both = (
         moves_with_clocks(twice, solution, [PoseNoise(clock_s=0.03), PoseNoise(clock_s=other_s)])
         for other_s in (0.0, 0.03)
     )
-    assert (first.poses.shape[2], both.poses.shape[2]) == (1, 2)
+    assert (first.poses.shape[2], of_both.poses.shape[2]) == (1, 2)
     along_m = np.abs(first.poses[:, 0, 0])
     assert along_m[:20].min() > 3 * along_m[40:].max()
 
@@ -126,8 +126,8 @@ def test_second_moments_are_of_prior_and_evidence_together():
     noise = [PoseNoise(clock_s=0.003)]
     silent = ClockEvidence(np.zeros((1, 1)), np.zeros(1))
     np.testing.assert_allclose(second_moments(silent, noise), [[0.003]])
-    told = ClockEvidence(np.array([[2 * 0.003**-2.0]]), np.zeros(1))
-    np.testing.assert_allclose(second_moments(told, noise), [[0.003 / 3**0.5]])
+    clock_evidence = ClockEvidence(np.array([[2 * 0.003**-2.0]]), np.zeros(1))
+    np.testing.assert_allclose(second_moments(clock_evidence, noise), [[0.003 / 3**0.5]])
     # The mean is two thirds of the 6 ms that the observations say: its square counts, too.
     late = ClockEvidence(np.array([[2 * 0.003**-2.0]]), np.array([2 * 0.006 / 0.003**2]))
     np.testing.assert_allclose(second_moments(late, noise), [[(0.004**2 + 0.003**2 / 3) ** 0.5]])

@@ -61,8 +61,8 @@ def parts(problem, tmp_path_factory):
 
     def moved(number, part, solution):
         follow = follow_of(solution, steps[number][:, :2])
-        known = ClockErrors(np.eye(2), rising[part.frames], follow)
-        return part, moves_with_clocks(part.problem, solution, NOISES, known)
+        errors = ClockErrors(np.eye(2), rising[part.frames], follow)
+        return part, moves_with_clocks(part.problem, solution, NOISES, errors)
 
     return segments, finish_parts(folder, joint, shape, moved)
 
@@ -79,15 +79,15 @@ def test_parts_together_tell_as_much_of_the_clock_as_the_whole(problem, whole, p
     off = score + net @ solved.flat(solved.residuals)
     assert (np.abs(off) < 0.15 * np.sqrt(np.diag(information))).all()
     # Noise that is drawn for parts and for the whole is not the same.
-    told = evidence_of(segments)
+    joined = evidence_of(segments)
     multiple = noise_multiples(late, solved)
-    np.testing.assert_allclose(np.diag(information) / np.diag(told.information), multiple, rtol=0.1)
+    np.testing.assert_allclose(np.diag(information) / np.diag(joined.information), multiple, rtol=0.1)
 
 
 def test_parts_follow_an_error_of_the_clock_as_the_whole_does(problem, whole, parts):
     _, moved = parts
-    known = ClockErrors(np.eye(2), np.linspace(-0.5, 0.5, 60), to_optimum)
-    moves = moves_with_clocks(problem, whole, NOISES, known)
+    errors = ClockErrors(np.eye(2), np.linspace(-0.5, 0.5, 60), to_optimum)
+    moves = moves_with_clocks(problem, whole, NOISES, errors)
     for part, of_part in moved:
         for name, index in (("corners", part.corners), ("poses", part.frames), ("extrinsic", part.cameras)):
             ours = getattr(of_part, name)

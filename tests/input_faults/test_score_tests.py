@@ -23,9 +23,9 @@ def scene(seed=3):
 
 
 def found_of(problem, fault, camera, axis=0):
-    found = score_faults(problem, solve(problem, OPTIONS))
-    (one,) = [s for s in found if (s.fault, s.camera, s.axis) == (fault, camera, axis)]
-    return one
+    tests = score_faults(problem, solve(problem, OPTIONS))
+    (test,) = [s for s in tests if (s.fault, s.camera, s.axis) == (fault, camera, axis)]
+    return test
 
 
 def with_focal(problem, factor, axes=(0, 1)):
@@ -36,7 +36,7 @@ def with_focal(problem, factor, axes=(0, 1)):
 
 def test_a_right_problem_contradicts_nothing():
     problem = scene().problem
-    assert all(one.sigmas < 4 for one in score_faults(problem, solve(problem, OPTIONS)))
+    assert all(test.sigmas < 4 for test in score_faults(problem, solve(problem, OPTIONS)))
 
 
 def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it():
@@ -44,40 +44,44 @@ def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it():
     step = 5e-4
     low, middle, high = (2 * solve(with_focal(problem, 1 + p), OPTIONS).cost for p in (-step, 0.0, step))
     curvature, slope = (high - 2 * middle + low) / step**2, (high - low) / (2 * step)
-    one = found_of(problem, table.FOCAL, -1)
-    assert one.value == pytest.approx(-slope / curvature, rel=0.05)
-    assert one.sigma == pytest.approx((2 / curvature) ** 0.5, rel=0.3), "by what the stretches disagree"
-    assert 0 < one.gain < slope**2 / (4 * curvature), "stretches that the others predict gain less"
-    assert one.value == pytest.approx(-0.002, abs=4 * one.sigma)
+    test = found_of(problem, table.FOCAL, -1)
+    assert test.value == pytest.approx(-slope / curvature, rel=0.05)
+    assert test.sigma == pytest.approx((2 / curvature) ** 0.5, rel=0.3), "by what the stretches disagree"
+    assert 0 < test.gain < slope**2 / (4 * curvature), "stretches that the others predict gain less"
+    assert test.value == pytest.approx(-0.002, abs=4 * test.sigma)
 
 
 def test_an_error_of_a_lens_moves_the_corners_as_solving_with_it_does():
     problem = scene().problem
-    found = {(one.fault, one.camera, one.axis): one for one in score_faults(problem, solve(problem, OPTIONS))}
+    test_of = {
+        (test.fault, test.camera, test.axis): test for test in score_faults(problem, solve(problem, OPTIONS))
+    }
     step = 1e-3
     wrong, right = (solve(with_focal(problem, 1 + p), OPTIONS).corners_map for p in (step, 0.0))
     moved_m = np.sqrt(np.mean(np.sum((wrong - right) ** 2, axis=1)))
-    assert found[table.FOCAL, -1, 0].moves_m == pytest.approx(moved_m / step, rel=0.05)
-    assert found[table.CROWN, -1, 0].moves_m == 0.0
+    assert test_of[table.FOCAL, -1, 0].moves_m == pytest.approx(moved_m / step, rel=0.05)
+    assert test_of[table.CROWN, -1, 0].moves_m == 0.0
 
 
 def test_fy_is_contradicted_where_an_error_of_both_focal_lengths_would_be_too_small_to_matter():
     street = make_scene(3, frames=150, every_m=3.0, jitter=POSES, start_error_deg=0.5)
     problem = with_focal(street.problem, 1.02, (1,))
-    found = [one for one in score_faults(problem, solve(problem, OPTIONS)) if one.fault is table.FOCAL]
-    both, fy = (next(one for one in found if (one.camera, one.axis) == (-1, axis)) for axis in (0, 1))
-    assert both.sigmas > 5
-    assert not is_contradicted(both)
+    of_focal = [test for test in score_faults(problem, solve(problem, OPTIONS)) if test.fault is table.FOCAL]
+    of_both, fy = (
+        next(test for test in of_focal if (test.camera, test.axis) == (-1, axis)) for axis in (0, 1)
+    )
+    assert of_both.sigmas > 5
+    assert not is_contradicted(of_both)
     assert is_contradicted(fy)
     assert fy.value == pytest.approx(-0.02, abs=3 * fy.sigma)
 
 
 def test_a_late_clock_is_found_and_named_first():
     late = with_late_clocks(scene(), np.array([0.06, 0.0])).problem
-    found = score_faults(late, solve(late, OPTIONS))
-    assert (found[0].fault, found[0].camera) == (table.CLOCK, 0)
-    assert found[0].value == pytest.approx(0.06, abs=0.01)
-    assert found[0].sigmas > 7
+    tests = score_faults(late, solve(late, OPTIONS))
+    assert (tests[0].fault, tests[0].camera) == (table.CLOCK, 0)
+    assert tests[0].value == pytest.approx(0.06, abs=0.01)
+    assert tests[0].sigmas > 7
 
 
 def test_stamps_that_jitter_do_not_look_like_positions_that_are_stretched():
@@ -85,13 +89,13 @@ def test_stamps_that_jitter_do_not_look_like_positions_that_are_stretched():
     recorded = street.problem.map_from_vehicle.copy()
     jitter_m = np.random.default_rng(1).normal(0.0, 6 * POSES.position_m, (len(recorded), 1))
     recorded[:, :3, 3] += jitter_m * recorded[:, :3, 0]
-    one = found_of(replace(street.problem, map_from_vehicle=recorded), table.SCALE, -1)
-    assert one.sigmas < 2.5
+    test = found_of(replace(street.problem, map_from_vehicle=recorded), table.SCALE, -1)
+    assert test.sigmas < 2.5
     stretched = street.problem.map_from_vehicle.copy()
     stretched[:, :2, 3] *= 1.1
-    one = found_of(replace(street.problem, map_from_vehicle=stretched), table.SCALE, -1)
-    assert one.value == pytest.approx(-0.1, abs=0.02)
-    assert one.sigmas > 4
+    test = found_of(replace(street.problem, map_from_vehicle=stretched), table.SCALE, -1)
+    assert test.value == pytest.approx(-0.1, abs=0.02)
+    assert test.sigmas > 4
 
 
 def test_a_survey_is_held_against_what_the_drive_says_without_it():
@@ -104,9 +108,9 @@ def test_a_survey_is_held_against_what_the_drive_says_without_it():
     free = solve(replace(wrong, centre_sigma_m=sigma), OPTIONS)
     rotation, translation = free.cam_from_vehicle[0, :3, :3], free.cam_from_vehicle[0, :3, 3]
     without_m = float((-rotation.T @ translation)[2])
-    one = found_of(wrong, table.SURVEY, 0, 2)
-    assert one.value == pytest.approx(without_m - centre[0, 2], abs=0.02)
-    assert one.sigmas > 5
+    test = found_of(wrong, table.SURVEY, 0, 2)
+    assert test.value == pytest.approx(without_m - centre[0, 2], abs=0.02)
+    assert test.sigmas > 5
 
 
 def test_centres_that_are_all_off_alike_are_laid_to_the_point_of_the_poses():
@@ -125,9 +129,9 @@ def test_known_sizes_that_the_paint_does_not_have_are_told_with_those_that_it_ha
     first = np.flatnonzero(np.abs(np.linalg.norm(np.diff(corners, axis=0), axis=1) - side_m) < 1e-6)
     stated = KnownLengths(first, first + 1, np.full(len(first), side_m - 0.05), np.full(len(first), 0.005))
     problem = replace(street.problem, lengths=stated)
-    one = score_faults(problem, solve(problem, OPTIONS))[0]
-    assert one.fault is table.SIZE
-    assert one.value == pytest.approx(0.05, abs=0.005)
+    test = score_faults(problem, solve(problem, OPTIONS))[0]
+    assert test.fault is table.SIZE
+    assert test.value == pytest.approx(0.05, abs=0.005)
 
 
 def test_one_surveyed_point_off_is_told_from_all_off():
@@ -136,9 +140,9 @@ def test_one_surveyed_point_off_is_told_from_all_off():
     points = street.corners_map[chosen].copy()
     points[1] += (0.2, 0.0)
     control = ControlPoints(chosen, points, np.full((len(chosen), 2), 0.01))
-    one = score_faults(p := replace(street.problem, control=control), solve(p, OPTIONS))[0]
-    assert (one.fault, one.item) == (table.CONTROL, 1)
-    assert one.value == pytest.approx(0.2, abs=0.05)
+    test = score_faults(p := replace(street.problem, control=control), solve(p, OPTIONS))[0]
+    assert (test.fault, test.item) == (table.CONTROL, 1)
+    assert test.value == pytest.approx(0.2, abs=0.05)
 
 
 def test_a_pose_that_nothing_was_seen_from_is_as_uncertain_as_stated_and_others_less():
@@ -153,8 +157,8 @@ def test_a_pose_that_nothing_was_seen_from_is_as_uncertain_as_stated_and_others_
         np.tile(stated, (len(problem.map_from_vehicle), 1)),
         rtol=0.05,
     )
-    seen = solve(problem, OPTIONS).covariance.poses()
-    assert (np.median(seen, axis=0) < 0.7 * stated).all()
+    sigmas = solve(problem, OPTIONS).covariance.poses()
+    assert (np.median(sigmas, axis=0) < 0.7 * stated).all()
 
 
 def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_more_where_not():
@@ -162,38 +166,40 @@ def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_mor
     right = pose_innovations(solve(problem, OPTIONS))
     assert np.sqrt(np.mean(right.normalised**2, axis=0)).max() < 1.2
     small = replace(problem, pose_sigma=PoseSigma(0.01, 0.0001, 0.002, 0.005))
-    found = pose_innovations(solve(small, OPTIONS))
-    heading = found.normalised[:, found.state == POSE_STATES.index("heading")]
+    innovations = pose_innovations(solve(small, OPTIONS))
+    heading = innovations.normalised[:, innovations.state == POSE_STATES.index("heading")]
     assert np.sqrt(np.mean(heading**2, axis=0)).max() > 1.4
 
 
 def test_observations_that_the_loss_has_switched_off_do_not_vote():
     """Wrong associations put corners into the camera's plane, where residuals and derivatives are huge."""
     street = scene()
-    problem, seen = street.problem, street.problem.observations
+    problem, observations = street.problem, street.problem.observations
     cam_from_map = street.cam_from_vehicle[0] @ np.linalg.inv(problem.map_from_vehicle)
     row = cam_from_map[:, 2]
     depth_m = street.corners_map @ row[:, :2].T + row[:, 3]
-    corner, frame = (one[:6] for one in np.nonzero((depth_m > 0.01) & (depth_m < 0.1)))
+    corner, frame = (rows[:6] for rows in np.nonzero((depth_m > 0.01) & (depth_m < 0.1)))
     assert len(corner) == 6
     more = replace(
-        seen,
-        camera=np.append(seen.camera, np.zeros(6, dtype=seen.camera.dtype)),
-        frame=np.append(seen.frame, frame),
-        corner=np.append(seen.corner, corner),
-        pinhole_px=np.vstack([seen.pinhole_px, np.full((6, 2), 300.0)]),
-        covariance_px=np.concatenate([seen.covariance_px, np.tile(np.eye(2), (6, 1, 1))]),
+        observations,
+        camera=np.append(observations.camera, np.zeros(6, dtype=observations.camera.dtype)),
+        frame=np.append(observations.frame, frame),
+        corner=np.append(observations.corner, corner),
+        pinhole_px=np.vstack([observations.pinhole_px, np.full((6, 2), 300.0)]),
+        covariance_px=np.concatenate([observations.covariance_px, np.tile(np.eye(2), (6, 1, 1))]),
     )
     wrong, robust = replace(problem, observations=more), replace(OPTIONS, loss="cauchy")
-    assert all(one.sigmas < 5 for one in score_faults(wrong, solve(wrong, robust)))
+    assert all(test.sigmas < 5 for test in score_faults(wrong, solve(wrong, robust)))
 
 
 def seen_again(scene, cam_from_vehicle, map_from_vehicle, z_m=0.0):
     """The scene's observations (K,) by cameras (K, 4, 4) at poses (K, 4, 4), their corners at heights."""
-    seen = scene.problem.observations
-    pixel = project(cam_from_vehicle @ np.linalg.inv(map_from_vehicle), scene.corners_map[seen.corner], z_m)
+    observations = scene.problem.observations
+    pixel = project(
+        cam_from_vehicle @ np.linalg.inv(map_from_vehicle), scene.corners_map[observations.corner], z_m
+    )
     pixel += np.random.default_rng(0).normal(0, PIXEL_SIGMA, pixel.shape)
-    return replace(scene.problem, observations=replace(seen, pinhole_px=pixel))
+    return replace(scene.problem, observations=replace(observations, pinhole_px=pixel))
 
 
 def turned(deg: float, axis: int):
@@ -202,22 +208,22 @@ def turned(deg: float, axis: int):
 
 def knocked(scene: Scene):
     """The first camera is turned by .6 deg in yaw, about its centre, halfway."""
-    seen = scene.problem.observations
-    cameras = scene.cam_from_vehicle[seen.camera].copy()
-    own = cameras[0]
-    turn = own @ turned(0.6, 2) @ np.linalg.inv(own)
+    observations = scene.problem.observations
+    cameras = scene.cam_from_vehicle[observations.camera].copy()
+    poses = cameras[0]
+    turn = poses @ turned(0.6, 2) @ np.linalg.inv(poses)
     turn[:3, 3] = 0.0
-    later = (seen.camera == 0) & (seen.frame >= len(scene.map_from_vehicle) // 2)
+    later = (observations.camera == 0) & (observations.frame >= len(scene.map_from_vehicle) // 2)
     cameras[later] = turn @ cameras[later]
-    return seen_again(scene, cameras, scene.map_from_vehicle[seen.frame])
+    return seen_again(scene, cameras, scene.map_from_vehicle[observations.frame])
 
 
 def loaded(scene: Scene):
     """The vehicle, and all cameras with it, pitches by .6 deg halfway."""
-    seen = scene.problem.observations
+    observations = scene.problem.observations
     poses = scene.map_from_vehicle.copy()
     poses[len(poses) // 2 :] = poses[len(poses) // 2 :] @ turned(0.6, 1)
-    return seen_again(scene, scene.cam_from_vehicle[seen.camera], poses[seen.frame])
+    return seen_again(scene, scene.cam_from_vehicle[observations.camera], poses[observations.frame])
 
 
 def stepped(scene: Scene):
@@ -243,24 +249,29 @@ def scaled(scene: Scene):
 
 def crowned(scene: Scene):
     """The ground falls by 3 % to both sides of the route."""
-    seen = scene.problem.observations
+    observations = scene.problem.observations
     poses = scene.map_from_vehicle
     away = scene.corners_map[:, None] - poses[None, :, :2, 3]
     nearest = np.linalg.norm(away, axis=2).argmin(axis=1)
     aside = np.abs(np.einsum("na,na->n", away[np.arange(len(away)), nearest], poses[nearest, :2, 1]))
     return seen_again(
-        scene, scene.cam_from_vehicle[seen.camera], poses[seen.frame], -0.03 * aside[seen.corner]
+        scene,
+        scene.cam_from_vehicle[observations.camera],
+        poses[observations.frame],
+        -0.03 * aside[observations.corner],
     )
 
 
 def drifting(scene: Scene):
     """Clocks of both cameras go wrong by .1 s from the first image to the last."""
     late = with_late_clocks(scene, np.zeros(2))
-    seen, twist = late.problem.observations, late.problem.twist_vehicle
+    observations, twist = late.problem.observations, late.problem.twist_vehicle
     assert twist is not None
-    share = seen.frame / (len(scene.map_from_vehicle) - 1) - 0.5
-    then = late.problem.map_from_vehicle[seen.frame] @ exp(twist[seen.frame] * 0.1 * share[:, None])
-    again = seen_again(scene, scene.cam_from_vehicle[seen.camera], then)
+    share = observations.frame / (len(scene.map_from_vehicle) - 1) - 0.5
+    then = late.problem.map_from_vehicle[observations.frame] @ exp(
+        twist[observations.frame] * 0.1 * share[:, None]
+    )
+    again = seen_again(scene, scene.cam_from_vehicle[observations.camera], then)
     return replace(late.problem, observations=again.observations)
 
 
@@ -309,21 +320,23 @@ def test_noise_that_goes_together_along_the_route_contradicts_nothing():
     worst = []
     for seed in range(3):
         street = make_scene(seed, frames=80, every_m=3.0, jitter=None, start_error_deg=0.3)
-        rng, seen = np.random.default_rng(seed), street.problem.observations
+        rng, observations = np.random.default_rng(seed), street.problem.observations
         smooth = np.array([np.convolve(row, np.hanning(9), "same") for row in rng.normal(size=(2, 80))])
         smooth *= 0.006 / smooth.std()
         tangent = np.zeros((80, 6))
         tangent[:, 3:5] = smooth.T
         poses = street.map_from_vehicle @ exp(tangent)
-        problem = seen_again(street, street.cam_from_vehicle[seen.camera], poses[seen.frame])
-        worst.append(max(one.sigmas for one in score_faults(problem, solve(problem, OPTIONS))))
+        problem = seen_again(street, street.cam_from_vehicle[observations.camera], poses[observations.frame])
+        worst.append(max(test.sigmas for test in score_faults(problem, solve(problem, OPTIONS))))
     assert max(worst) < 5
 
 
-def narrowing(found, fault: Fault, axis: int) -> float:
+def narrowing(score_tests, fault: Fault, axis: int) -> float:
     """Median of what the tests of a change take off the sigma under the stated noise."""
-    tests = [one for one in found if (one.fault, one.axis) == (fault, axis) and np.isfinite(one.sigma)]
-    return float(np.median([one.sigma / one.model_sigma for one in tests]))
+    tests = [
+        test for test in score_tests if (test.fault, test.axis) == (fault, axis) and np.isfinite(test.sigma)
+    ]
+    return float(np.median([test.sigma / test.model_sigma for test in tests]))
 
 
 def test_positions_and_headings_that_err_less_than_stated_leave_the_noise_of_pitch_as_it_is():
@@ -333,9 +346,9 @@ def test_positions_and_headings_that_err_less_than_stated_leave_the_noise_of_pit
     for seed in range(3):
         street = make_scene(seed, frames=80, every_m=3.0, jitter=true, start_error_deg=0.3)
         problem = replace(street.problem, pose_sigma=stated)
-        found = score_faults(problem, solve(problem, OPTIONS))
-        of_pitch.append(narrowing(found, table.KNOCK, 1))
-        of_position.append(narrowing(found, table.STEP, 0))
+        tests = score_faults(problem, solve(problem, OPTIONS))
+        of_pitch.append(narrowing(tests, table.KNOCK, 1))
+        of_position.append(narrowing(tests, table.STEP, 0))
     assert np.median(of_position) < 0.7
     assert np.median(of_pitch) > 0.8
 
@@ -348,9 +361,9 @@ def test_an_answer_grows_with_its_column_however_large():
         name: torch.randn(row.shape, generator=generator, dtype=row.dtype)
         for name, row in solved.residuals.items()
     }
-    one = solved.flat(solved.efficient(column))
+    answer = solved.flat(solved.efficient(column))
     many = solved.flat(solved.efficient({name: 1e25 * row for name, row in column.items()}))
-    np.testing.assert_allclose(many / 1e25, one, atol=1e-6 * np.abs(one).max())
+    np.testing.assert_allclose(many / 1e25, answer, atol=1e-6 * np.abs(answer).max())
 
 
 def test_columns_that_are_solved_for_together_are_those_of_each_alone():

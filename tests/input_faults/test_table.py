@@ -76,16 +76,16 @@ def test_a_new_fault_is_tested_for_weighed_named_and_recovered_from_by_its_recor
     assert is_contradicted(leans), "it is weighed"
     assert log_odds(leans) == pytest.approx(100.0 - np.log1p(1.5**2))
 
-    told = Contradiction(**vars(leans), cameras=("front", "rear"))
-    finding = check_inputs(evidence(score_tests=(told,)))[0]
+    contradiction = Contradiction(**vars(leans), cameras=("front", "rear"))
+    finding = check_inputs(evidence(score_tests=(contradiction,)))[0]
     assert (finding.check, finding.status) == ("tyres", Status.FAIL), "it is named"
     assert finding.says.startswith("the vehicle leans by 0.03 rad to the right (13 sigmas)")
     assert finding.says.endswith("pump them up")
-    quiet = replace(told, value=0.0, p_value=0.5)
+    quiet = replace(contradiction, value=0.0, p_value=0.5)
     assert ("tyres", Status.PASS) in [
         (f.check, f.status) for f in check_inputs(evidence(score_tests=(quiet,)))
     ]
-    mended = check_inputs(evidence(corrected=(told,)))[0]
+    mended = check_inputs(evidence(corrected=(contradiction,)))[0]
     assert "no size was trusted" in mended.says
 
     inputs = Inputs(None, (), (), MappingOptions())  # type: ignore[arg-type]
@@ -96,8 +96,8 @@ def test_a_new_fault_is_tested_for_weighed_named_and_recovered_from_by_its_recor
 
 @pytest.mark.usefixtures("with_a_new_fault")
 def test_evidence_comes_back_from_the_cache_and_from_other_processes_as_it_was():
-    told = Contradiction(ROLLED.name, -1, 0, -1, 0.03, 0.002, 0.002, 1e-40, 100.0, ("front", "rear"))
-    whole = evidence(score_tests=(told,), foreign=ForeignSegment(1.0, 2.0, 3.0))
+    contradiction = Contradiction(ROLLED.name, -1, 0, -1, 0.03, 0.002, 0.002, 1e-40, 100.0, ("front", "rear"))
+    whole = evidence(score_tests=(contradiction,), foreign=ForeignSegment(1.0, 2.0, 3.0))
     for copy in (decode(encode(whole), SolveEvidence), pickle.loads(pickle.dumps(whole))):
         assert copy.score_tests == whole.score_tests
         assert copy.score_tests[0].fault is ROLLED
@@ -119,9 +119,9 @@ def test_the_table_and_the_odds_are_read_without_torch():
 
 
 def test_slip_is_named_before_a_clock_that_explains_as_much_and_contradicts_nothing():
-    both = ("front", "rear")
+    cameras = ("front", "rear")
     slip = Contradiction(table.SLIP.name, -1, 0, -1, 0.004, 0.001, 0.001, 3e-5, 8.0)
-    clock = Contradiction(table.CLOCK.name, -1, 0, -1, 0.015, 0.0036, 0.003, 3e-5, 8.0, both)
+    clock = Contradiction(table.CLOCK.name, -1, 0, -1, 0.015, 0.0036, 0.003, 3e-5, 8.0, cameras)
     assert log_odds(slip) > log_odds(clock) + np.log(10)
     assert not is_contradicted(slip)
     findings = check_inputs(evidence(score_tests=(slip, clock)))

@@ -42,7 +42,7 @@ def solved(inputs):
 
 
 def test_on_a_highway_lanes_make_yaw_and_pitch_much_surer(highway, solved):
-    (_, without), (error, joint) = (mounting_of(one, highway) for one in solved)
+    (_, without), (error, joint) = (mounting_of(optimum, highway) for optimum in solved)
     pitch, yaw = joint[1:3] / without[1:3]
     assert yaw <= 0.6
     assert pitch <= 0.6
@@ -74,8 +74,8 @@ def test_points_of_a_line_show_their_own_errors(highway, solved):
 def test_the_direction_of_a_line_is_its_knot_s_and_not_its_points(solved):
     """Otherwise errors of an image and of its Jacobian were correlated, which turned the camera by roll."""
     knots, rig = solved[1].bundle.knots, solved[0].bundle.rig
-    own = np.flatnonzero(knots.unknown >= 0)[knots.knot]
-    ends_map = knots.points_map[own] + np.array([[[-1e-4]], [[1e-4]]]) * knots.along[own]
+    rows = np.flatnonzero(knots.unknown >= 0)[knots.knot]
+    ends_map = knots.points_map[rows] + np.array([[[-1e-4]], [[1e-4]]]) * knots.along[rows]
     ground = np.dstack([ends_map, np.zeros(ends_map.shape[:2]), np.ones(ends_map.shape[:2])])
     cam = np.einsum("kij,ekj->eki", rig.cam_from_map(knots.camera, knots.frame)[:, :3], ground)
     behind, ahead = (cam @ rig.intrinsic[0].T)[..., :2] / cam[..., 2:]
@@ -107,21 +107,21 @@ def test_a_vertex_states_what_extrinsics_and_poses_leave_open(solved):
 
 def test_knots_move_across_their_line_only(solved):
     knots, solution = solved[1].bundle.knots, solved[1].bundle.solution
-    seen = knots.unknown >= 0
-    moved = solution.corners_map[-knots.count :] - knots.points_map[seen]
-    assert np.abs((moved * knots.along[seen]).sum(axis=1)).max() < 1e-3
+    is_free = knots.unknown >= 0
+    moved = solution.corners_map[-knots.count :] - knots.points_map[is_free]
+    assert np.abs((moved * knots.along[is_free]).sum(axis=1)).max() < 1e-3
     assert np.abs(moved).max() > 2e-3
 
 
 @pytest.mark.parametrize("count", [2, 3, 6])
 def test_a_spline_runs_through_its_knots_and_follows_lines_and_bends(count):
-    knots, wanted = 2.0 * np.arange(count), np.linspace(0, 2.0 * (count - 1), 23)
-    weight = _catmull_rom(knots, wanted).toarray()
+    knots, stations = 2.0 * np.arange(count), np.linspace(0, 2.0 * (count - 1), 23)
+    weight = _catmull_rom(knots, stations).toarray()
     np.testing.assert_allclose(weight.sum(axis=1), 1)
-    np.testing.assert_allclose(weight @ knots, wanted, atol=1e-12)
+    np.testing.assert_allclose(weight @ knots, stations, atol=1e-12)
     np.testing.assert_allclose(_catmull_rom(knots, knots).toarray(), np.eye(count), atol=1e-12)
     if count > 2:
-        np.testing.assert_allclose(weight @ knots**2, wanted**2, atol=1e-10)
+        np.testing.assert_allclose(weight @ knots**2, stations**2, atol=1e-10)
 
 
 def test_a_turn_of_eight_metres_is_followed_to_a_millimetre():
@@ -134,7 +134,7 @@ def test_a_turn_of_eight_metres_is_followed_to_a_millimetre():
 
 def test_a_line_that_too_few_images_show_is_named_and_keeps_its_place(highway, inputs, solved, caplog):
     options = replace(JOINTLY.lanes, min_images=1)
-    few = [one for one in highway.detections if one.image in (20, 21)]
+    few = [in_image for in_image in highway.detections if in_image.image in (20, 21)]
     rig = solved[0].bundle.rig
     arguments = highway.drive, few, ("front",), rig, None
     assert find_knots(*arguments, options).count
@@ -146,7 +146,7 @@ def test_a_line_that_too_few_images_show_is_named_and_keeps_its_place(highway, i
 
 
 def test_a_drive_without_lane_paint_has_no_knots(highway, inputs, solved):
-    bare = [replace(one, lanes=()) for one in highway.detections]
+    bare = [replace(in_image, lanes=()) for in_image in highway.detections]
     assert find_knots(highway.drive, bare, ("front",), solved[0].bundle.rig, None, JOINTLY.lanes) is None
 
 
@@ -154,8 +154,8 @@ def test_sigmas_survive_writing_and_reading_as_features(solved):
     bundle = solved[1].bundle
     lanes = draw_lanes(bundle.knots, bundle.solution, 0.5)
     again = map_of(features_of(HDMap((), lanes)), range(1, len(lanes) + 1), None)
-    for one, other in zip(lanes, again.lanes, strict=True):
-        np.testing.assert_array_equal(one.sigma_m, other.sigma_m)
+    for lane, other in zip(lanes, again.lanes, strict=True):
+        np.testing.assert_array_equal(lane.sigma_m, other.sigma_m)
 
 
 @pytest.mark.parametrize("along", [[1.0, 0.0], [0.0, 1.0], [-0.6, 0.8], [1e-9, 1.0]])

@@ -66,12 +66,12 @@ def mapped(true, seed):
     return HDMap(
         tuple(
             replace(
-                own,
-                corners_map=own.corners_map + (root @ rng.standard_normal(8)).reshape(4, 2),
+                marking,
+                corners_map=marking.corners_map + (root @ rng.standard_normal(8)).reshape(4, 2),
                 covariance_m2=covariance,
                 relative_sigma_m=MAP_SIGMA_M,
             )
-            for own in true.markings
+            for marking in true.markings
         ),
         true.lanes,
     )
@@ -81,11 +81,11 @@ def moved(hd_map, share, by_m, seed=0, beyond_m=-np.inf):
     """A map of which a share of the markings, from a place on, was repainted so far away since."""
     rng = np.random.default_rng([seed, 2])
     markings = []
-    for own in hd_map.markings:
+    for marking in hd_map.markings:
         angle = rng.uniform(0, 2 * np.pi)
-        is_moved = rng.random() < share and own.corners_map[:, 0].mean() > beyond_m
+        is_moved = rng.random() < share and marking.corners_map[:, 0].mean() > beyond_m
         off = by_m * np.array([np.cos(angle), np.sin(angle)]) * is_moved
-        markings.append(replace(own, corners_map=own.corners_map + off))
+        markings.append(replace(marking, corners_map=marking.corners_map + off))
     return HDMap(tuple(markings))
 
 
@@ -130,8 +130,8 @@ def drive(painted, seed, seconds=8.0, speed=4.0, begin_m=12.0, turned=None, kmh=
     frames = np.arange(every, len(stamp_s), every)
     calibrations = cameras()
     mounts = {
-        name: exp(rng.multivariate_normal(np.zeros(6), MOUNT)) @ own.cam_from_vehicle
-        for name, own in calibrations.items()
+        name: exp(rng.multivariate_normal(np.zeros(6), MOUNT)) @ calibration.cam_from_vehicle
+        for name, calibration in calibrations.items()
     }
     looks = []
     for frame in frames.tolist():
@@ -152,13 +152,13 @@ def _look(camera, stamp_s, cam_from_map, painted, rng):
     pixels, depth_m = project_ground(INTRINSIC, np.tile(cam_from_map, (len(corners), 1, 1)), corners)
     inside = ((pixels > 0) & (pixels < [1280, 720])).all(axis=(1, 2)) & (depth_m > 0).all(axis=1)
     inside &= (depth_m < 14).all(axis=1) & (rng.random(len(corners)) > 0.1)
-    found = []
+    markings = []
     for j in np.flatnonzero(inside).tolist():
         noisy = np.roll(pixels[j] + SIGMA_PX * rng.standard_normal((4, 2)), int(rng.integers(4)), axis=0)
         covariance = SIGMA_PX**2 * np.eye(8)
-        found.append(MarkingDetection(painted.markings[j].kind, 0.95, noisy, covariance, np.ones(4, bool)))
+        markings.append(MarkingDetection(painted.markings[j].kind, 0.95, noisy, covariance, np.ones(4, bool)))
     lanes = tuple(_piece(cam_from_map, lane.points_map, rng) for lane in painted.lanes)
-    return Look(camera, float(stamp_s), tuple(found), tuple(lane for lane in lanes if lane is not None))
+    return Look(camera, float(stamp_s), tuple(markings), tuple(lane for lane in lanes if lane is not None))
 
 
 def _piece(cam_from_map, points_map, rng):
@@ -183,8 +183,10 @@ def word_at(x_m, y_m=0.0, kind="text"):
 def outlined(points_px, kind="text", is_seen=True):
     """A detection with an outline."""
     nothing = np.full((4, 2), np.nan)
-    seen = np.full(len(points_px), is_seen)
-    return MarkingDetection(kind, 0.8, nothing, np.full((8, 8), np.nan), np.zeros(4, bool), points_px, seen)
+    is_edge_seen = np.full(len(points_px), is_seen)
+    return MarkingDetection(
+        kind, 0.8, nothing, np.full((8, 8), np.nan), np.zeros(4, bool), points_px, is_edge_seen
+    )
 
 
 def with_words(look, pose, words):
@@ -193,13 +195,13 @@ def with_words(look, pose, words):
     if look.camera != "front":
         return look
     cam_from_map = calibration.cam_from_vehicle @ np.linalg.inv(pose)
-    found = []
+    outlines = []
     for word in words:
         cam = np.column_stack([word.outline_map, np.zeros(4), np.ones(4)]) @ cam_from_map[:3].T
         px = (cam @ calibration.info.intrinsic.T)[:, :2] / cam[:, 2:]
         if (cam[:, 2] > 2).all() and (cam[:, 2] < 20).all() and ((px > 0) & (px < [1280, 720])).all():
-            found.append(outlined(px + 0.5))
-    return replace(look, markings=(*look.markings, *found))
+            outlines.append(outlined(px + 0.5))
+    return replace(look, markings=(*look.markings, *outlines))
 
 
 def follow(driven, hd_map, seed=0, prior=True, calibrations=None):
@@ -213,7 +215,7 @@ def follow(driven, hd_map, seed=0, prior=True, calibrations=None):
 
 def tracked(driven, poses):
     """The errors (K, 3) of the tracked poses, and their bounds."""
-    known = [(k, pose) for k, pose in enumerate(poses) if pose.status == Status.TRACKING]
-    errors = np.array([driven.errors(pose, k) for k, pose in known]).reshape(-1, 3)
-    bounds = np.array([(*pose.protection_m, pose.protection_rad) for _, pose in known]).reshape(-1, 3)
+    tracked_poses = [(k, pose) for k, pose in enumerate(poses) if pose.status == Status.TRACKING]
+    errors = np.array([driven.errors(pose, k) for k, pose in tracked_poses]).reshape(-1, 3)
+    bounds = np.array([(*pose.protection_m, pose.protection_rad) for _, pose in tracked_poses]).reshape(-1, 3)
     return errors, bounds

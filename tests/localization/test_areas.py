@@ -47,10 +47,10 @@ def test_the_middle_of_a_hull_is_that_of_its_area_wherever_its_points_are():
 
 def test_a_word_tells_about_where_the_vehicle_is():
     belief, scene, area_map = before([word_at(8.0)], x_m=0.5)
-    taken = with_areas(belief, scene, area_map, hulls_of(shown(8.0)))
-    assert len(taken.observations) == 1
-    assert abs(taken.belief.mean[0]) < 0.15
-    along_m = float(np.sqrt(taken.belief.covariance([0])[0, 0]))
+    update = with_areas(belief, scene, area_map, hulls_of(shown(8.0)))
+    assert len(update.observations) == 1
+    assert abs(update.belief.mean[0]) < 0.15
+    along_m = float(np.sqrt(update.belief.covariance([0])[0, 0]))
     assert 0.1 < along_m < 0.25
 
 

@@ -63,10 +63,10 @@ def test_what_a_late_odometry_has_not_told_yet_is_open():
         mean = state.mean.copy()
         mean[belief.LATE] = late_s
         late = belief.replace(state, mean=mean)
-        told = belief.predict(late, log.pieces(0.0, 0.1), noise).covariance([0, 1, 2])
+        measured = belief.predict(late, log.pieces(0.0, 0.1), noise).covariance([0, 1, 2])
         all_of_it = belief.predict(late, log.pieces(0.0, 0.1), noise, has_untold=True).covariance([0, 1, 2])
         # Half the acceleration by the time squared: of the lateness, and of its own sigma of 50 ms. Within a
         # tenth of a second an acceleration that lasts for one changes by 0.44 of its sigma.
         squared_s2 = (late_s**2 + noise.late_s**2) * np.sqrt(2 * (1 - np.exp(-0.1)))
         sigmas = np.array([0.5 * 1.5 * squared_s2, 0.0, 0.5 * 0.3 * squared_s2])
-        np.testing.assert_allclose(np.diag(all_of_it - told), sigmas**2, rtol=1e-3, atol=1e-9)
+        np.testing.assert_allclose(np.diag(all_of_it - measured), sigmas**2, rtol=1e-3, atol=1e-9)

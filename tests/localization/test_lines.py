@@ -46,11 +46,11 @@ def piece_of(y_m, first_m=5.0, last_m=14.0, slope=0.0):
 
 def test_a_piece_tells_distance_and_direction_and_nothing_along_the_line():
     belief, scene, line_map = before([line_at(-1.7)], y_m=0.06, heading_rad=0.004)
-    taken = with_lines(belief, scene, line_map, [piece_of(-1.7), piece_of(-1.7, 6.0, 12.0)])
-    assert len(taken.observations) == 2
-    assert taken.belief.mean[1] == pytest.approx(0.0, abs=0.01)
-    assert taken.belief.mean[HEADING] == pytest.approx(0.0, abs=0.0015)
-    sigma = np.sqrt(np.diag(taken.belief.covariance([0, 1, HEADING])))
+    update = with_lines(belief, scene, line_map, [piece_of(-1.7), piece_of(-1.7, 6.0, 12.0)])
+    assert len(update.observations) == 2
+    assert update.belief.mean[1] == pytest.approx(0.0, abs=0.01)
+    assert update.belief.mean[HEADING] == pytest.approx(0.0, abs=0.0015)
+    sigma = np.sqrt(np.diag(update.belief.covariance([0, 1, HEADING])))
     assert sigma[0] == pytest.approx(SIGMA[0], rel=0.01)
     assert sigma[1] < 0.5 * SIGMA[1]
     assert sigma[2] < 0.5 * SIGMA[2]

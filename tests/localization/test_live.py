@@ -167,7 +167,7 @@ def test_speeds_in_kilometres_per_hour_are_said():
 def test_yaw_rates_in_degrees_are_said():
     localizer = Localizer(yard(0), cameras())
     pose = localizer.update([], [Motion(0.1 * k, 4.0, 12.0) for k in range(5)])
-    assert "5 samples of the odometry are no motion of a road vehicle" in pose.reasons[0]
+    assert "5 samples of the odometry are impossible for a road vehicle" in pose.reasons[0]
 
 
 def test_images_in_another_order_give_the_same_pose():
@@ -182,8 +182,8 @@ def test_images_in_another_order_give_the_same_pose():
         late.append([look for look in looks if look.camera == "rear"])
         now = [look for look in looks if look.camera == "front"]
         localizer.update([*(late.pop(0) if len(late) > 2 else ()), *now], motion)
-    rest = [look for looks in (*late, *driven.looks[-2:]) for look in looks]
-    pose = localizer.update(rest, [sample for part in driven.motion[-2:] for sample in part])
+    late_looks = [look for looks in (*late, *driven.looks[-2:]) for look in looks]
+    pose = localizer.update(late_looks, [sample for part in driven.motion[-2:] for sample in part])
     assert pose.status == in_order.status == Status.TRACKING
     np.testing.assert_allclose(pose.map_from_vehicle[:2, 3], in_order.map_from_vehicle[:2, 3], atol=0.01)
 
@@ -374,7 +374,7 @@ def test_lines_of_an_odometry_are_json_or_csv_and_may_hold_positions():
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("{", "line 1: is no JSON object"),
+        ("{", "line 1: is not a JSON object"),
         ("time,v", "names no motion"),
         ('{"speed": 3}', "give stamp_s, speed_m_s, yaw_rate_rad_s"),
         ('{"stamp_s": 1, "speed_m_s": "fast", "yaw_rate_rad_s": 0}', "speed_m_s is 'fast'; give a number"),
@@ -390,25 +390,25 @@ def test_a_line_that_is_no_motion_is_one_line(line, says):
 
 def test_detections_go_through_their_json_lines():
     driven = drive(lined(yard(17)), 17, seconds=1.0)
-    seen = driven.looks[0][0]
+    first_look = driven.looks[0][0]
     silent = (np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, bool))
     outline_px = np.array([[500.0, 400.0], [560.0, 400.0], [560.0, 440.0]])
     word = MarkingDetection("text", 0.8, *silent, outline_px, np.array([True, False, True]))
-    look = replace(seen, markings=(*seen.markings, word))
+    look = replace(first_look, markings=(*first_look.markings, word))
     nothing = np.empty((0, 2))
     lanes = tuple(RoadLane(lane, nothing, np.empty((0, 2, 2))) for lane in look.lanes)
     road = Road(tuple(RoadMarking(m, nothing, np.empty((0, 0)), nothing) for m in look.markings), lanes)
     frame = Frame("image", "image", 0, look.stamp_s, np.zeros((1, 1, 3), np.uint8))
     again = look_of(json.loads(json.dumps(as_record(frame, "front", road))), "front")
     assert again.stamp_s == look.stamp_s
-    for one, two in zip(look.markings, again.markings, strict=True):
-        np.testing.assert_allclose(one.corners_px, two.corners_px, atol=1e-3)
-        np.testing.assert_allclose(one.covariance_px, two.covariance_px, atol=1e-5)
-        np.testing.assert_allclose(one.outline_px, two.outline_px, atol=1e-3)
-        np.testing.assert_array_equal(one.outline_seen, two.outline_seen)
-    for one, two in zip(look.lanes, again.lanes, strict=True):
-        assert one.kind == two.kind
-        np.testing.assert_allclose(one.points_px, two.points_px, atol=1e-3)
+    for marking, two in zip(look.markings, again.markings, strict=True):
+        np.testing.assert_allclose(marking.corners_px, two.corners_px, atol=1e-3)
+        np.testing.assert_allclose(marking.covariance_px, two.covariance_px, atol=1e-5)
+        np.testing.assert_allclose(marking.outline_px, two.outline_px, atol=1e-3)
+        np.testing.assert_array_equal(marking.outline_seen, two.outline_seen)
+    for lane, two in zip(look.lanes, again.lanes, strict=True):
+        assert lane.kind == two.kind
+        np.testing.assert_allclose(lane.points_px, two.points_px, atol=1e-3)
 
 
 def test_a_line_of_a_pose_is_json_whatever_is_unknown():
@@ -424,8 +424,8 @@ def test_the_localiser_needs_no_more_than_the_base_install():
     absent = "('torch', 'scipy', 'hydra', 'kornia', 'numba', 'matplotlib')"
     program = f"import sys\nfor name in {absent}: sys.modules[name] = None\n"
     program += "import v2hdm.localization.live, v2hdm.localization.stream, v2hdm.localization.localizer"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
 
 
 def test_lines_come_as_images_do_and_end_with_the_cameras(monkeypatch, tmp_path):
@@ -518,6 +518,6 @@ def test_sources_that_are_none_are_one_line(arguments, says, tmp_path, capsys):
     write_geojson(yard(0), tmp_path / "map.geojson")
     write_calibration(cameras()["front"], tmp_path / "calibration_front.yaml")
     (tmp_path / "motion.csv").write_text("")
-    given = f"localize {tmp_path} --live {arguments} --motion {tmp_path / 'motion.csv'}"
-    assert run(given.split()) == 2
+    words = f"localize {tmp_path} --live {arguments} --motion {tmp_path / 'motion.csv'}"
+    assert run(words.split()) == 2
     assert says in capsys.readouterr().err

@@ -27,8 +27,8 @@ def looking_ahead():
 def mapped(true, rng, sigma_m=0.01):
     """A yard as a drive has mapped it."""
     block = sigma_m**2 * np.eye(8)
-    corners = [one.corners_map + sigma_m * rng.standard_normal((4, 2)) for one in true.markings]
-    kinds = [one.kind for one in true.markings]
+    corners = [marking.corners_map + sigma_m * rng.standard_normal((4, 2)) for marking in true.markings]
+    kinds = [marking.kind for marking in true.markings]
     return HDMap(tuple(Marking(kind, c, 10, block, sigma_m) for kind, c in zip(kinds, corners, strict=True)))
 
 
@@ -126,11 +126,11 @@ def test_where_nothing_is_painted_the_vehicle_says_that_it_is_lost_and_finds_its
 def test_a_detection_that_two_markings_could_explain_is_not_used():
     rng = np.random.default_rng(3)
     dashes = HDMap(tuple(Marking("lane_dash", DASH + np.array([x, 1.8]), 10) for x in (8.0, 11.0)))
-    seen = seen_from(np.zeros(5), dashes, rng)[:1]
+    sightings = seen_from(np.zeros(5), dashes, rng)[:1]
     unsure = start(pose_of(np.zeros(5)), 3.0, 0.02, ATTITUDE_RAD)
-    assert locate(unsure, seen, Markings(dashes))[1] == []
+    assert locate(unsure, sightings, Markings(dashes))[1] == []
     sure = start(pose_of(np.zeros(5)), 0.3, 0.02, ATTITUDE_RAD)
-    assert len(locate(sure, seen, Markings(dashes))[1]) == 1
+    assert len(locate(sure, sightings, Markings(dashes))[1]) == 1
 
 
 def test_a_corner_that_would_lie_at_the_horizon_is_no_match_whatever_it_seems_to_say():

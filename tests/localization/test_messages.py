@@ -95,11 +95,11 @@ def test_the_node_answers_images_with_poses(monkeypatch):
     driven = drive(painted, 21, seconds=2.0)
     place = node.Place.__new__(node.Place)
     place.localizer = Localizer(mapped(painted, 21), cameras(), driven.rough(np.random.default_rng(0)))
-    seen = {}
+    received = {}
 
     class Road:
         def detect(self, pixels, regions_px=None):
-            markings = [SimpleNamespace(image=marking) for marking in seen["look"].markings]
+            markings = [SimpleNamespace(image=marking) for marking in received["look"].markings]
             return SimpleNamespace(markings=markings, lanes=[], is_whole=regions_px is None)
 
     place.roads = {name: Road() for name in cameras()}
@@ -107,7 +107,7 @@ def test_the_node_answers_images_with_poses(monkeypatch):
         for sample in motion:
             place.moved(odometry(*(float(value) for value in sample)))
         for look in looks:
-            seen["look"] = look
+            received["look"] = look
             answers = dict(place.saw(look.camera, Messages().header(look.stamp_s, "").stamp, None))
     assert json.loads(answers["status"].data)["status"] == "tracking"
     at = answers["pose"].pose.pose.position

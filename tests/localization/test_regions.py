@@ -27,7 +27,7 @@ def in_regions(look, regions_px):
     is_in = ((low > regions_px[:, :2]) & (high < regions_px[:, 2:])).all(axis=2).any(axis=1)
     return replace(
         look,
-        markings=tuple(m for m, kept in zip(look.markings, is_in, strict=True) if kept),
+        markings=tuple(m for m, is_kept in zip(look.markings, is_in, strict=True) if is_kept),
         lanes=(),
         is_whole=False,
     )
@@ -110,7 +110,7 @@ def test_markings_that_are_hidden_make_the_next_look_a_full_one():
 def followed_by_second_looks(driven, hd_map, late, changed=lambda frame, look: look):
     """As ``followed``, with whole searches that come so many moments after the looks at parts."""
     localizer = Localizer(hd_map, driven.calibrations, driven.rough(np.random.default_rng(0)))
-    poses, told, waiting = [], [], []
+    poses, answers, waiting = [], [], []
     for frame, (looks, motion) in enumerate(zip(driven.looks, driven.motion, strict=True)):
         localizer.update([look for due, look in waiting if due == frame])
         localizer.update([], motion)
@@ -120,23 +120,23 @@ def followed_by_second_looks(driven, hd_map, late, changed=lambda frame, look: l
             (frame + late, replace(look, is_second=True)) for look in shown if now[look.camera].is_all_later
         ]
         poses.append(localizer.update([in_regions(look, now[look.camera].regions_px) for look in shown]))
-        told.append(now)
-    return poses, told
+        answers.append(now)
+    return poses, answers
 
 
 @pytest.mark.parametrize("late", [1, 3])
 def test_whole_searches_follow_looks_at_parts_and_come_as_often(late):
     painted = yard(2)
     driven = drive(painted, 2)
-    poses, told = followed_by_second_looks(driven, mapped(painted, 2), late)
+    poses, answers = followed_by_second_looks(driven, mapped(painted, 2), late)
     for camera in ("front", "rear"):
         tracked = [
-            now[camera] for now, pose in zip(told, poses, strict=True) if pose.status == Status.TRACKING
+            now[camera] for now, pose in zip(answers, poses, strict=True) if pose.status == Status.TRACKING
         ]
         assert np.mean([ahead.regions_px is None for ahead in tracked]) < 0.1
         whole = [
             frame
-            for frame, now in enumerate(told)
+            for frame, now in enumerate(answers)
             if now[camera].is_all_later or now[camera].regions_px is None
         ]
         assert max(np.diff(whole)) <= 5
@@ -153,8 +153,8 @@ def test_whole_searches_follow_looks_at_parts_and_come_as_often(late):
 def test_where_no_whole_search_comes_an_image_is_searched_at_once():
     painted = yard(2)
     driven = drive(painted, 2)
-    _, told = followed_by_second_looks(driven, mapped(painted, 2), late=1000)
-    at_once = [frame for frame, now in enumerate(told) if now["front"].regions_px is None]
+    _, answers = followed_by_second_looks(driven, mapped(painted, 2), late=1000)
+    at_once = [frame for frame, now in enumerate(answers) if now["front"].regions_px is None]
     assert 5 < max(np.diff(at_once)) <= 10
 
 
@@ -162,18 +162,20 @@ def test_while_an_image_is_searched_at_once_the_next_ones_are_not():
     painted = yard(2)
     driven = drive(painted, 2)
     localizer = Localizer(mapped(painted, 2), driven.calibrations, driven.rough(np.random.default_rng(0)))
-    at_once, told = [], []
+    at_once, are_searched = [], []
     for looks, motion in zip(driven.looks, driven.motion, strict=True):
         localizer.update([], motion)
         now = {look.camera: localizer.glance(look.camera, look.stamp_s) for look in looks}
         localizer.update([in_regions(look, now[look.camera].regions_px) for look in looks])
-        told.append([ahead.regions_px is None for ahead in localizer.ahead("front", looks[0].stamp_s)])
+        are_searched.append(
+            [ahead.regions_px is None for ahead in localizer.ahead("front", looks[0].stamp_s)]
+        )
         at_once.append(now["front"].regions_px is None)
     # No whole search ever follows a look at parts: now and then one comes at once, the images after it wait.
-    begun = at_once.index(False)
-    told = told[begun:]
-    assert any(images[0] for images in told)
-    assert not any(images[0] and images[1] for images in told)
+    first = at_once.index(False)
+    are_searched = are_searched[first:]
+    assert any(images[0] for images in are_searched)
+    assert not any(images[0] and images[1] for images in are_searched)
 
 
 def test_of_two_cameras_that_show_too_little_one_gives_way_for_one_image():
@@ -183,23 +185,24 @@ def test_of_two_cameras_that_show_too_little_one_gives_way_for_one_image():
     def changed(frame, look):
         return replace(look, markings=()) if 40 <= frame < 43 else look
 
-    _, told = followed_by_second_looks(driven, mapped(painted, 2), 2, changed)
+    _, answers = followed_by_second_looks(driven, mapped(painted, 2), 2, changed)
     at_once = {
-        camera: [told[frame][camera].regions_px is None for frame in (41, 42)] for camera in ("front", "rear")
+        camera: [answers[frame][camera].regions_px is None for frame in (41, 42)]
+        for camera in ("front", "rear")
     }
     assert at_once == {"front": [True, True], "rear": [False, True]}
-    assert told[41]["rear"].is_all_later
+    assert answers[41]["rear"].is_all_later
 
 
 def test_what_second_looks_alone_show_speaks_against_the_map():
     painted = yard(3)
     extra = [Marking("diamond", DIAMOND + np.array([x, 5.5]), 10) for x in np.arange(30.0, 100.0, 2.0)]
     driven = drive(replace(painted, markings=(*painted.markings, *extra)), 3)
-    poses, told = followed_by_second_looks(driven, mapped(painted, 3), 2)
+    poses, answers = followed_by_second_looks(driven, mapped(painted, 3), 2)
     entered = int(np.argmax(driven.poses[:, 0, 3] > 22.0))
     said = next(frame for frame, pose in enumerate(poses) if frame >= entered and pose.reasons)
     assert "the map explains" in poses[said].reasons[0]
-    assert any(now["front"].is_all_later for now in told[entered : said + 1])
+    assert any(now["front"].is_all_later for now in answers[entered : said + 1])
 
 
 def test_a_second_look_at_an_image_that_nobody_knows_changes_nothing():
@@ -219,8 +222,8 @@ def test_until_the_place_is_sure_all_is_searched():
     painted = yard(5)
     driven = drive(painted, 5, seconds=2.0)
     poses, regions = followed(driven, mapped(painted, 5))
-    begun = next(frame for frame, pose in enumerate(poses) if pose.status == Status.TRACKING)
-    assert all(box is None for now in regions[: begun + 1] for box in now.values())
+    first = next(frame for frame, pose in enumerate(poses) if pose.status == Status.TRACKING)
+    assert all(box is None for now in regions[: first + 1] for box in now.values())
 
 
 def test_where_markings_were_repainted_it_is_said_with_looks_at_regions_too():
@@ -278,13 +281,13 @@ class Asked:
 
 def test_a_camera_is_told_of_the_images_to_come_by_the_clock_of_its_files():
     eye = _Eye("front", io.StringIO(), delay_s=0.02)
-    asked = Asked(np.array([[1.0, 2.0, 3.0, 4.0]]))
-    eye.point(asked, now_s=5.15)
-    assert asked.now_s == pytest.approx(5.13)
-    told = [json.loads(line) for line in eye.stream.getvalue().splitlines()]
-    assert [line["stamp_s"] for line in told] == pytest.approx([5.22, 5.32])
-    assert [line["regions_px"] for line in told] == [[[1.0, 2.0, 3.0, 4.0]], None]
-    assert [line.get("all_later", False) for line in told] == [True, False]
+    answer_to_eye = Asked(np.array([[1.0, 2.0, 3.0, 4.0]]))
+    eye.point(answer_to_eye, now_s=5.15)
+    assert answer_to_eye.now_s == pytest.approx(5.13)
+    lines = [json.loads(line) for line in eye.stream.getvalue().splitlines()]
+    assert [line["stamp_s"] for line in lines] == pytest.approx([5.22, 5.32])
+    assert [line["regions_px"] for line in lines] == [[[1.0, 2.0, 3.0, 4.0]], None]
+    assert [line.get("all_later", False) for line in lines] == [True, False]
 
 
 def test_a_camera_that_has_ended_is_told_nothing_more():
@@ -325,47 +328,47 @@ def view():
 def test_of_every_five_images_one_is_whole_however_late_they_are_told(view, late):
     """An image is told of ``late`` images before, when newer ones have not been seen."""
     looking = Looking(5)
-    told = {}
+    regions_of = {}
     wholes = []
     for number in range(60):
-        regions_px = told.get(number)
+        regions_px = regions_of.get(number)
         wholes.append(regions_px is None)
         looking.of("front").note(0.1 * number, regions_px is None, 9)
         first = number + late + 1
         stamps_s = [0.1 * (first + later) for later in range(4)]
         for later, ahead in enumerate(looking.ahead("front", stamps_s, lambda stamp_s: view, 4.0)):
-            told[first + later] = ahead.regions_px
+            regions_of[first + later] = ahead.regions_px
     assert max(np.diff(np.flatnonzero(wholes))) <= 5
     assert np.mean(wholes[10:]) <= 0.25
 
 
 def test_cameras_search_whole_images_by_turns(view):
     looking = Looking(5)
-    told = dict.fromkeys(("front", "rear"))
-    both = []
+    regions_of = dict.fromkeys(("front", "rear"))
+    are_both_whole = []
     for number in range(60):
-        both.append(told["front"] is None and told["rear"] is None)
-        for camera, regions_px in told.items():
+        are_both_whole.append(regions_of["front"] is None and regions_of["rear"] is None)
+        for camera, regions_px in regions_of.items():
             looking.of(camera).note(0.1 * number, regions_px is None, 9)
-        for camera in told:
+        for camera in regions_of:
             (ahead,) = looking.ahead(camera, [0.1 * (number + 1)], lambda stamp_s: view, 4.0)
-            told[camera] = ahead.regions_px
-    assert not any(both[6:])
+            regions_of[camera] = ahead.regions_px
+    assert not any(are_both_whole[6:])
 
 
 def test_a_camera_keeps_out_of_the_way_of_whole_searches_that_another_one_needs(view):
     """Requests go out four images ahead: the camera ahead is to search three in a row as a whole."""
     looking = Looking(5)
-    told = {"front": {}, "rear": {}}
-    both = []
+    regions_of = {"front": {}, "rear": {}}
+    are_both_whole = []
     rear = []
     for number in range(80):
-        now = {camera: of_camera.get(number) is None for camera, of_camera in told.items()}
-        both.append(all(now.values()))
+        now = {camera: of_camera.get(number) is None for camera, of_camera in regions_of.items()}
+        are_both_whole.append(all(now.values()))
         rear.append(now["rear"])
         for camera, is_whole in now.items():
             looking.of(camera).note(0.1 * number, is_whole, 9)
-        for camera, of_camera in told.items():
+        for camera, of_camera in regions_of.items():
 
             def view_at(stamp_s, camera=camera):
                 needs_all = camera == "front" and round(10 * stamp_s) % 17 in (0, 1, 2)
@@ -374,5 +377,5 @@ def test_a_camera_keeps_out_of_the_way_of_whole_searches_that_another_one_needs(
             stamps_s = [0.1 * (number + later) for later in range(1, 5)]
             for ahead in looking.ahead(camera, stamps_s, view_at, 4.0):
                 of_camera[round(10 * ahead.stamp_s)] = ahead.regions_px
-    assert not any(both[6:])
+    assert not any(are_both_whole[6:])
     assert max(np.diff(np.flatnonzero(rear))) <= 5

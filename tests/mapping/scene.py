@@ -96,8 +96,8 @@ def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Ma
         for name in sorted(options.cameras):
             images.append(Image(name, FRAME_S * j, Path(f"{name}/{j:06d}.jpg"), recorded[j]))
             at = truth[name], true_poses[j], twist[j]
-            seen = _look(cameras[name].info, *at, markings, lanes, options, rng)
-            detections.append(ImageDetections(len(images) - 1, *seen))
+            look = _look(cameras[name].info, *at, markings, lanes, options, rng)
+            detections.append(ImageDetections(len(images) - 1, *look))
     heading_rad, jitter_rad = (max(np.deg2rad(a), 2e-4) for a in (options.heading_deg, options.jitter_deg))
     none = dict.fromkeys(("position_drift_m", "heading_drift_rad", "roll_pitch_drift_rad"), 0.0)
     noise = PoseNoise(max(options.rtk_m, 0.005), heading_rad, jitter_rad, **none)
@@ -209,8 +209,10 @@ def _project(info: CameraInfo, cam_from_map: FloatArray, points: FloatArray) -> 
     cam = (cam_from_map[..., :3, :] @ ground[..., None])[..., 0]
     depth = np.maximum(cam[:, 2], 1e-3)
     pinhole = cam[:, :2] / depth[:, None] * [900.0, 900.0] + [640.0, 350.0]
-    seen = (cam[:, 2] > 1) & (np.abs(pinhole - [640, 350]) < [900, 600]).all(axis=1)
-    return distort_points(info, np.where(seen[:, None], pinhole, 0.0)), np.where(seen, cam[:, 2], -1.0)
+    is_visible = (cam[:, 2] > 1) & (np.abs(pinhole - [640, 350]) < [900, 600]).all(axis=1)
+    return distort_points(info, np.where(is_visible[:, None], pinhole, 0.0)), np.where(
+        is_visible, cam[:, 2], -1.0
+    )
 
 
 def _inside(px: FloatArray, depth: FloatArray, options: SceneOptions, margin: float = 5.0) -> np.ndarray:
@@ -229,7 +231,7 @@ def _look(
     rng: np.random.Generator,
 ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
     project = _project_rows(info, cam_from_vehicle, map_from_vehicle, twist, options.read_out_s)
-    found = []
+    markings_found = []
     for marking in markings:
         if np.linalg.norm(marking.corners_map[0] - map_from_vehicle[:2, 3]) > options.max_range_m + 5:
             continue
@@ -237,11 +239,11 @@ def _look(
         inside = _inside(px, depth, options)
         if inside.sum() < 2 or rng.random() > options.detection_rate:
             continue
-        found.append(_detection(marking.kind, px, inside, options, rng))
+        markings_found.append(_detection(marking.kind, px, inside, options, rng))
     if rng.random() < options.false_rate * 6:
         px = np.array([640.0, 450.0]) + rng.uniform(-200, 200, 2)
         quad = np.array([[30.0, 0], [0, -15], [-30, 0], [0, 15]]) * rng.uniform(0.5, 2) + px
-        found.append(_detection("diamond", quad, np.ones(4, bool), options, rng))
+        markings_found.append(_detection("diamond", quad, np.ones(4, bool), options, rng))
     strips = [("lane_line", lane.points_map) for lane in lanes if lane.kind == "lane_line"]
     strips += [("lane_dash", _centre_line(m.corners_map)) for m in markings if m.kind == "lane_dash"]
     rows = []
@@ -252,7 +254,7 @@ def _look(
             noise = rng.normal(size=(int(keep.sum()), 2)) * 2 * options.pixel_sigma
             near_to_far = np.argsort(depth[keep])
             rows.append(LaneDetection(kind, 0.9, (px[keep] + noise)[near_to_far]))
-    return tuple(found), tuple(rows)
+    return tuple(markings_found), tuple(rows)
 
 
 def _centre_line(dash: FloatArray) -> FloatArray:
@@ -305,8 +307,8 @@ DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
 def repainted(markings: list[Marking]) -> list[Marking]:
     """Some diamonds moved, some removed, some added."""
     out = [
-        replace(one, corners_map=one.corners_map + MOVED.get(k, (0.0, 0.0)))
-        for k, one in enumerate(markings)
+        replace(marking, corners_map=marking.corners_map + MOVED.get(k, (0.0, 0.0)))
+        for k, marking in enumerate(markings)
         if k not in REMOVED
     ]
     return out + [Marking("diamond", DIAMOND + place, 0) for place in ADDED]

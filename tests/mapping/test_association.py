@@ -62,8 +62,8 @@ def located_at(corners, ray):
 
 def tracks_under(rig, sightings, sigma_rad):
     located = locate(sightings, rig)
-    near = located.range_m <= MAX_RANGE_M
-    located = replace(located, valid=located.valid & near, informs=located.informs & near)
+    is_near = located.range_m <= MAX_RANGE_M
+    located = replace(located, valid=located.valid & is_near, informs=located.informs & is_near)
     return build_tracks(sightings, located, rig, sigma_rad, PoseNoise(0.01, roll_pitch_rad=0.0017)), located
 
 
@@ -117,8 +117,8 @@ def test_two_markings_of_one_image_are_never_merged(sightings):
 
 def test_groups_are_renumbered_when_rows_are_dropped_and_are_the_same_under_other_numbers():
     association = Association(np.array([0, 1, 2, 1, -1]), np.arange(5) % 4, 3)
-    kept = keep_rows(association, np.array([False, True, True, True, True]))
-    assert (kept.group.tolist(), kept.count) == ([-1, 0, 1, 0, -1], 2)
+    renumbered = keep_rows(association, np.array([False, True, True, True, True]))
+    assert (renumbered.group.tolist(), renumbered.count) == ([-1, 0, 1, 0, -1], 2)
     a, b, c = (
         Association(np.array(group), np.zeros(5, int), count)
         for group, count in (([0, 0, 1, 2, -1], 3), ([5, 5, 0, 1, 1], 6), ([5, 0, 0, 1, 1], 6))

@@ -21,7 +21,9 @@ from v2hdm.site.living.map_errors import Errors, updated_lanes
 def base_of(result, folder):
     """A result as the base of the next one, by way of its file."""
     write_geojson(result.hd_map, folder / "map.geojson")
-    left_out = tuple((one.kind, one.position_map, one.sightings) for one in result.excluded)
+    left_out = tuple(
+        (exclusion.kind, exclusion.position_map, exclusion.sightings) for exclusion in result.excluded
+    )
     return Base(read_geojson(folder / "map.geojson"), result.poses.map_from_vehicle, left_out)
 
 
@@ -32,8 +34,8 @@ def before():
 
 @pytest.fixture(scope="module")
 def base(before, tmp_path_factory):
-    found = run_methods(before.drive, before.detections, ("front", "rear"))["Opt"]
-    return base_of(found, tmp_path_factory.mktemp("base"))
+    optimum = run_methods(before.drive, before.detections, ("front", "rear"))["Opt"]
+    return base_of(optimum, tmp_path_factory.mktemp("base"))
 
 
 @pytest.fixture(scope="module")
@@ -56,22 +58,22 @@ def test_what_moved_is_listed_with_its_way_and_nothing_else(before, updated):
     assert len(moved) == len(MOVED)
     for number, shift in MOVED.items():
         centre = before.markings[number].corners_map.mean(axis=0)
-        (one,) = [change for change in moved if near(change.before, centre)]
-        assert one.shift_m == pytest.approx(np.array(shift), abs=0.03)
-        assert one.shift_sigma_m is not None
-        assert (one.shift_sigma_m < 0.02).all()
-        assert near(one.after, centre + shift)
-        assert one.probability > 0.99
+        (change,) = [change for change in moved if near(change.before, centre)]
+        assert change.shift_m == pytest.approx(np.array(shift), abs=0.03)
+        assert change.shift_sigma_m is not None
+        assert (change.shift_sigma_m < 0.02).all()
+        assert near(change.after, centre + shift)
+        assert change.probability > 0.99
 
 
 def test_what_vanished_left_the_map_and_stays_in_the_list(before, updated):
     now, result = updated
     gone = changes_of(result).of(Fate.VANISHED)
     centres = [before.markings[k].corners_map.mean(axis=0) for k in REMOVED]
-    assert all(any(near(one.before, centre) for one in gone) for centre in centres)
+    assert all(any(near(change.before, centre) for change in gone) for centre in centres)
     assert len(gone) == len(REMOVED)
-    assert all(one.views >= 5 and one.views_showing == 0 and one.after is None for one in gone)
-    assert not {one.id for one in gone} & {one.id for one in result.hd_map.markings}
+    assert all(change.views >= 5 and change.views_showing == 0 and change.after is None for change in gone)
+    assert not {feature.id for feature in gone} & {feature.id for feature in result.hd_map.markings}
     pairs, _ = match(result.hd_map, now.markings, 0.3)
     assert len(pairs) == len(result.hd_map.markings)
 
@@ -80,46 +82,46 @@ def test_new_paint_has_an_id_that_no_other_ever_had(base, updated):
     result = updated[1]
     new = changes_of(result).of(Fate.NEW)
     assert len(new) == len(ADDED)
-    assert all(any(near(one.after, np.array(place)) for one in new) for place in ADDED)
-    given = [one.id or 0 for one in (*base.hd_map.markings, *base.hd_map.lanes)]
-    assert min(one.id for one in new) > max(given)
+    assert all(any(near(change.after, np.array(place)) for change in new) for place in ADDED)
+    ids_of_base = [feature.id or 0 for feature in (*base.hd_map.markings, *base.hd_map.lanes)]
+    assert min(change.id for change in new) > max(ids_of_base)
 
 
 def test_ids_stay(base, updated):
-    vanished = {one.id for one in changes_of(updated[1]).of(Fate.VANISHED)}
-    moved = {one.id for one in changes_of(updated[1]).of(Fate.MOVED)}
-    now = {one.id: one for one in updated[1].hd_map.markings}
-    for one in base.hd_map.markings:
-        if one.id not in vanished | moved:
-            assert now[one.id].corners_map == pytest.approx(one.corners_map, abs=0.05)
-    assert {one.id for one in base.hd_map.markings} - vanished <= set(now)
-    ids = [one.id for one in (*updated[1].hd_map.markings, *updated[1].hd_map.lanes)]
+    vanished = {change.id for change in changes_of(updated[1]).of(Fate.VANISHED)}
+    moved = {change.id for change in changes_of(updated[1]).of(Fate.MOVED)}
+    now = {marking.id: marking for marking in updated[1].hd_map.markings}
+    for marking in base.hd_map.markings:
+        if marking.id not in vanished | moved:
+            assert now[marking.id].corners_map == pytest.approx(marking.corners_map, abs=0.05)
+    assert {marking.id for marking in base.hd_map.markings} - vanished <= set(now)
+    ids = [feature.id for feature in (*updated[1].hd_map.markings, *updated[1].hd_map.lanes)]
     assert len(set(ids)) == len(ids)
-    assert {one.id for one in base.hd_map.lanes} <= set(ids)
+    assert {lane.id for lane in base.hd_map.lanes} <= set(ids)
 
 
 def test_observations_bear_the_ids_and_corners_of_the_updated_map(updated):
     now, result = updated
     assert result.residuals is not None
-    corners = {one.id: one.corners_map for one in result.hd_map.markings}
+    corners = {marking.id: marking.corners_map for marking in result.hd_map.markings}
     images = {image.path.as_posix(): image for image in now.drive.images}
-    found, off_px = result.residuals, []
-    for k in np.flatnonzero((found.marking > 0) & found.is_point):
-        image = images[found.image[found.row_image[k]]]
+    residuals, off_px = result.residuals, []
+    for k in np.flatnonzero((residuals.marking > 0) & residuals.is_point):
+        image = images[residuals.image[residuals.row_image[k]]]
         calibration = result.calibrations[image.camera]
         cam_from_map = calibration.cam_from_vehicle @ inverse(result.poses.of_image(image))
-        corner = corners[found.marking[k]][found.corner[k]]
+        corner = corners[residuals.marking[k]][residuals.corner[k]]
         px = apply_homography(pinhole_px_from_ground(calibration.info.intrinsic, cam_from_map), corner)
-        off_px.append(np.linalg.norm(px - found.observed_px[k]))
-    assert {one.id for one in changes_of(result).of(Fate.NEW)} <= set(found.marking)
+        off_px.append(np.linalg.norm(px - residuals.observed_px[k]))
+    assert {change.id for change in changes_of(result).of(Fate.NEW)} <= set(residuals.marking)
     assert len(off_px) > 500
     assert np.percentile(off_px, 90) < 8.0
 
 
 def test_an_id_that_is_gone_is_never_given_again(tmp_path, updated):
     hd_map = updated[1].hd_map
-    last = max(one.id or 0 for one in hd_map.markings)
-    without = replace(hd_map, markings=tuple(one for one in hd_map.markings if one.id != last))
+    last = max(feature.id or 0 for feature in hd_map.markings)
+    without = replace(hd_map, markings=tuple(marking for marking in hd_map.markings if marking.id != last))
     fresh = replace(hd_map.markings[0], id=None)
     write_geojson(replace(without, markings=(*without.markings, fresh)), tmp_path / "map.geojson")
     again = read_geojson(tmp_path / "map.geojson")
@@ -128,7 +130,7 @@ def test_an_id_that_is_gone_is_never_given_again(tmp_path, updated):
 
 
 def test_a_map_of_another_place_is_refused(base, updated):
-    elsewhere = [replace(one, corners_map=one.corners_map + 2.4) for one in base.hd_map.markings]
+    elsewhere = [replace(marking, corners_map=marking.corners_map + 2.4) for marking in base.hd_map.markings]
     wrong = replace(base, hd_map=replace(base.hd_map, markings=tuple(elsewhere)))
     with pytest.raises(MappingError, match="is the map of this site and in this frame"):
         run_methods(updated[0].drive, updated[0].detections, ("front", "rear"), base=wrong)
@@ -148,12 +150,15 @@ def street(count):
 def mapped(corners, rng, over_m=30.0):
     """A map of the street: a drift that all share, and errors of each corner."""
     centres = corners.mean(axis=1)
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    root = np.linalg.cholesky(SHARED_M**2 * np.exp(-apart / over_m) + 1e-12 * np.eye(len(corners)))
+    distances_m = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    root = np.linalg.cholesky(SHARED_M**2 * np.exp(-distances_m / over_m) + 1e-12 * np.eye(len(corners)))
     drift = root @ rng.standard_normal((len(corners), 2))
     whole = OWN_M**2 * np.eye(8) + SHARED_M**2 * np.kron(np.ones((4, 4)), np.eye(2))
     noisy = corners + drift[:, None] + OWN_M * rng.standard_normal(corners.shape)
-    return [Marking("diamond", one, 10, whole, OWN_M / 2, id=k + 1) for k, one in enumerate(noisy)]
+    return [
+        Marking("diamond", corners_of_one, 10, whole, OWN_M / 2, id=k + 1)
+        for k, corners_of_one in enumerate(noisy)
+    ]
 
 
 def decided(old, new, looks=8):
@@ -174,7 +179,7 @@ def test_the_drift_of_either_map_counts_once():
         assert not by_new
         off = np.stack([by_old[k].corners_map for k in range(40)]) - corners
         squared.append(np.mean(off**2))
-        stated.append(np.mean([np.trace(one.covariance_m2) / 8 for one in by_old.values()]))
+        stated.append(np.mean([np.trace(change.covariance_m2) / 8 for change in by_old.values()]))
     expected = (SHARED_M**2 + OWN_M**2) / 2
     assert np.mean(stated) == pytest.approx(expected, rel=0.1)
     assert np.mean(squared) == pytest.approx(expected, rel=0.35)
@@ -211,11 +216,14 @@ def test_a_move_is_told_from_the_drift_of_two_maps(shift_m):
 def test_what_no_image_looked_at_is_not_gone():
     rng = np.random.default_rng(6)
     corners = street(30)
-    old, new = mapped(corners, rng), [one for k, one in enumerate(mapped(corners, rng)) if k not in (4, 9)]
+    old, new = (
+        mapped(corners, rng),
+        [marking for k, marking in enumerate(mapped(corners, rng)) if k not in (4, 9)],
+    )
     errors = [Errors.of(markings, 30.0) for markings in (old, new)]
-    there, bare = np.zeros(30), np.zeros(30)
-    there[4] = -9.0
-    decision = decide(old, new, *errors, Watched(there, bare), Watched.never(28))
+    log_odds, bare = np.zeros(30), np.zeros(30)
+    log_odds[4] = -9.0
+    decision = decide(old, new, *errors, Watched(log_odds, bare), Watched.never(28))
     assert decision.gone[4] > 0.95
     assert decision.gone[9] < 0.1
 
@@ -229,10 +237,10 @@ def test_a_lane_keeps_its_id_and_its_course_where_the_drive_has_none():
         Lane("lane_line", np.column_stack([along, 0.0 * along + 3.5]), 4),
     ]
     nothing = decided([], [])
-    kept, added = updated_lanes(old, new, nothing.shift, iter([8]).__next__)
-    assert (kept.id, kept.sightings, added.id) == (3, 9, 8)
-    assert (np.diff(kept.points_map[:, 0]) > 0).all()
-    inside = (kept.points_map[:, 0] > 20.1) & (kept.points_map[:, 0] < 39.4)
-    assert kept.points_map[inside, 1] == pytest.approx(0.1)
-    assert kept.points_map[~inside, 1] == pytest.approx(0.0, abs=0.11)
-    assert (kept.points_map[0, 0], kept.points_map[-1, 0]) == (0.0, 59.5)
+    course, added = updated_lanes(old, new, nothing.shift, iter([8]).__next__)
+    assert (course.id, course.sightings, added.id) == (3, 9, 8)
+    assert (np.diff(course.points_map[:, 0]) > 0).all()
+    inside = (course.points_map[:, 0] > 20.1) & (course.points_map[:, 0] < 39.4)
+    assert course.points_map[inside, 1] == pytest.approx(0.1)
+    assert course.points_map[~inside, 1] == pytest.approx(0.0, abs=0.11)
+    assert (course.points_map[0, 0], course.points_map[-1, 0]) == (0.0, 59.5)

@@ -27,15 +27,15 @@ def straight_in_turn(seed: int) -> Recipe:
 def test_a_clock_is_known_as_well_as_the_true_motion_tells_and_no_better(monkeypatch):
     world = make(straight_in_turn(4))
     drive = drive_of(world)
-    asked = []
+    solved = []
 
     def score(problem, solution):
-        asked.append((problem, solution))
+        solved.append((problem, solution))
         return score_faults(problem, solution)
 
     monkeypatch.setattr(recovery, "score_faults", score)
     run_methods(drive, detect(world, drive)[0], ("front", "rear"), MappingOptions(ground=PLANE))
-    problem, solution = asked[0]
+    problem, solution = solved[0]
     image_at = [image.map_from_vehicle[:2, 3] for image in drive.images]
     nearest = [
         int(np.linalg.norm(image_at - pose[:2, 3], axis=1).argmin()) for pose in problem.map_from_vehicle
@@ -43,7 +43,11 @@ def test_a_clock_is_known_as_well_as_the_true_motion_tells_and_no_better(monkeyp
     frame = [world.frame_of(drive.images[image]) for image in nearest]
     true = replace(problem, twist_vehicle=world.twist_vehicle[frame])
     sigma_s, true_sigma_s = (
-        {test.camera: test.model_sigma for test in score_faults(own, solution) if test.fault is table.CLOCK}
-        for own in (problem, true)
+        {
+            test.camera: test.model_sigma
+            for test in score_faults(problem_tested, solution)
+            if test.fault is table.CLOCK
+        }
+        for problem_tested in (problem, true)
     )
     assert sigma_s == pytest.approx(true_sigma_s, rel=0.1)

@@ -15,23 +15,26 @@ from v2hdm.verdict.results.solution import _ODDS_LIMIT
 FRAMES, IN_VIEW = 90, 8
 
 
-def stretch(monkeypatch, found, first_seen):
+def stretch(monkeypatch, is_found, first_seen):
     """The stretch of a drive whose marking g is in view from frame ``first_seen[g]`` on."""
     group = np.repeat(np.arange(len(first_seen)), IN_VIEW)
     frame = (first_seen[:, None] + np.arange(IN_VIEW)).ravel()
     inside = (frame >= 0) & (frame < FRAMES)
     group, frame = group[inside], frame[inside]
-    kept = np.array([found(g, f) for g, f in zip(group.tolist(), frame.tolist(), strict=True)])
+    is_sighting = np.array([is_found(g, f) for g, f in zip(group.tolist(), frame.tolist(), strict=True)])
     monkeypatch.setattr(foreign, "easy_views", lambda *_: (group, frame))
     poses, corners = np.tile(np.eye(4), (FRAMES, 1, 1)), np.zeros((len(first_seen), 4, 2))
     poses[:, 0, 3], corners[..., 0] = np.arange(FRAMES), (first_seen + IN_VIEW)[:, None]
     rig = SimpleNamespace(map_from_vehicle=poses)
     bundle = SimpleNamespace(
-        rig=rig, corners_map=corners, inliers=np.ones(kept.sum(), dtype=bool), group=group[kept],
-        row=np.arange(kept.sum()),
-    )  # fmt: skip
+        rig=rig,
+        corners_map=corners,
+        inliers=np.ones(is_sighting.sum(), dtype=bool),
+        group=group[is_sighting],
+        row=np.arange(is_sighting.sum()),
+    )
     stamps = 0.1 * np.arange(FRAMES)
-    sightings = SimpleNamespace(image=frame[kept], session=np.zeros(FRAMES, dtype=int), stamp_s=stamps)
+    sightings = SimpleNamespace(image=frame[is_sighting], session=np.zeros(FRAMES, dtype=int), stamp_s=stamps)
     views = SimpleNamespace(
         image=np.arange(FRAMES), frame=np.arange(FRAMES), camera=np.zeros(FRAMES, dtype=int)
     )
@@ -77,8 +80,8 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
     fault = ScoreTest(table.FOCAL.name, -1, 0, -1, **numbers, gain=worst + float(np.log1p(0.2**2)))
     solved = []
 
-    def settled(rest, _):
-        solved.append([one.image for one in rest.detections])
+    def settled(left_inputs, _):
+        solved.append([in_image.image for in_image in left_inputs.detections])
         if left is None:
             raise MappingError("no marking is left")
         return SimpleNamespace(row=np.arange(rows))
@@ -96,10 +99,10 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
     monkeypatch.setattr(recovery, "_tested", tested)
     images = [SimpleNamespace(stamp_s=float(n)) for n in range(10)]
     detections = [SimpleNamespace(image=n) for n in range(10)]
-    given = inputs.Inputs(SimpleNamespace(images=images, cameras={}), detections, (), None)  # type: ignore[arg-type]
+    all_inputs = inputs.Inputs(SimpleNamespace(images=images, cameras={}), detections, (), None)  # type: ignore[arg-type]
     whole = SimpleNamespace(row=np.arange(1200))
-    told = recovery._foreign(given, whole, (fault,) if worst else (), lambda _: None)  # type: ignore[arg-type]
-    return told[2], solved
+    answer = recovery._foreign(all_inputs, whole, (fault,) if worst else (), lambda _: None)  # type: ignore[arg-type]
+    return answer[2], solved
 
 
 def test_a_stretch_explains_what_a_solve_without_its_images_leaves_less_contradicted(monkeypatch):

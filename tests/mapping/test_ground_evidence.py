@@ -33,21 +33,21 @@ def scene(tilt_deg=0.0, higher_m=0.0):
 
 def test_the_markings_alone_are_those_of_a_solve_without_ground_and_survey():
     problem = scene(tilt_deg=0.1, higher_m=0.01)
-    apart = off_ground(bundle_of(problem))
+    differences = off_ground(bundle_of(problem))
     sigma_m = problem.centre_sigma_m.copy()
     sigma_m[:, 2] = np.inf
     alone = solve(replace(problem, ground=None, centre_sigma_m=sigma_m), OPTIONS).cam_from_vehicle
     for c, name in enumerate(("front", "rear")):
         height_m = -alone[c, :3, 2] @ alone[c, :3, 3]
-        assert abs(apart[name].up_m - (height_m - problem.ground.plane_cam[c, 3])) < 1e-3
+        assert abs(differences[name].up_m - (height_m - problem.ground.plane_cam[c, 3])) < 1e-3
         turn = np.cross(problem.ground.plane_cam[c, :3], alone[c, :3, 2])
         expected_deg = -np.rad2deg(alone[c, :3, :3].T @ turn)
-        np.testing.assert_allclose(apart[name].turn_deg, expected_deg, atol=0.01)
+        np.testing.assert_allclose(differences[name].turn_deg, expected_deg, atol=0.01)
 
 
 def test_a_right_ground_agrees_and_one_off_by_half_a_degree_does_not():
-    assert all(apart.sigmas < 2.5 for apart in off_ground(bundle_of(scene())).values())
-    assert all(apart.sigmas > 4.0 for apart in off_ground(bundle_of(scene(tilt_deg=0.5))).values())
+    assert all(difference.sigmas < 2.5 for difference in off_ground(bundle_of(scene())).values())
+    assert all(difference.sigmas > 4.0 for difference in off_ground(bundle_of(scene(tilt_deg=0.5))).values())
 
 
 def test_without_ground_there_is_nothing_to_compare():

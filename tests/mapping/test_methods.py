@@ -109,23 +109,25 @@ def test_a_straight_street_with_one_camera_and_only_dashes_gives_the_yaw():
     street = make_scene(
         SceneOptions(length_m=90.0, turns=False, dashes_only=True, cameras=("front",), step_m=1.2, seed=22)
     )
-    found = run_methods(street.drive, street.detections, ("front",))["Opt"]
-    pairs, _ = match(found.hd_map, street.markings, MATCH_M)
-    assert len(pairs) == len(found.hd_map.markings) >= 22
-    estimate = found.calibrations["front"].cam_from_vehicle
+    optimum = run_methods(street.drive, street.detections, ("front",))["Opt"]
+    pairs, _ = match(optimum.hd_map, street.markings, MATCH_M)
+    assert len(pairs) == len(optimum.hd_map.markings) >= 22
+    estimate = optimum.calibrations["front"].cam_from_vehicle
     assert rotation_error_deg(estimate, street.cam_from_vehicle["front"]) < 0.08
 
 
 def test_a_camera_that_saw_nothing_keeps_its_extrinsic(short_scene):
     drive = short_scene.drive
-    front_only = [found for found in short_scene.detections if drive.images[found.image].camera == "front"]
-    found = run_methods(drive, front_only, CAMERAS)["Opt"]
-    assert found.calibrations["rear"].covariance is None
-    assert found.calibrations["front"].covariance is not None
+    front_only = [
+        in_image for in_image in short_scene.detections if drive.images[in_image.image].camera == "front"
+    ]
+    optimum = run_methods(drive, front_only, CAMERAS)["Opt"]
+    assert optimum.calibrations["rear"].covariance is None
+    assert optimum.calibrations["front"].covariance is not None
 
 
 def test_a_drive_without_a_marking_says_so(scene):
-    nothing = [replace(found, markings=()) for found in scene.detections]
+    nothing = [replace(in_image, markings=()) for in_image in scene.detections]
     with pytest.raises(MappingError, match="no markings were found"):
         run_methods(scene.drive, nothing, ("front",))
 
@@ -142,9 +144,9 @@ def test_where_no_marking_lies_inside_the_regions_of_interest_the_naive_maps_are
         for name, camera in short_scene.drive.cameras.items()
     }
     drive = replace(short_scene.drive, cameras=cameras)
-    found = run_methods(drive, short_scene.detections, CAMERAS)
-    assert [len(found[name].hd_map.markings) for name in ("CNI", "ENI", "ONI")] == [0, 0, 0]
-    assert found["Opt"].hd_map.markings
+    methods = run_methods(drive, short_scene.detections, CAMERAS)
+    assert [len(methods[name].hd_map.markings) for name in ("CNI", "ENI", "ONI")] == [0, 0, 0]
+    assert methods["Opt"].hd_map.markings
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +154,10 @@ def both_modes():
     """A scene, its map of all at once and its map marking by marking."""
     scene = make_scene(SceneOptions(length_m=50.0, seed=5))
     options = (MappingOptions(), MappingOptions(mode="incremental"))
-    return scene, *(run_methods(scene.drive, scene.detections, CAMERAS, one)["Opt"] for one in options)
+    return scene, *(
+        run_methods(scene.drive, scene.detections, CAMERAS, mapping_options)["Opt"]
+        for mapping_options in options
+    )
 
 
 def test_marking_by_marking_the_map_is_nearly_that_of_all_at_once(both_modes):
@@ -230,7 +235,7 @@ def test_every_sighting_goes_through_kornia(short_scene, sightings, monkeypatch)
 def test_it_is_that_of_the_vehicle_to_a_nanometre(short_scene, sightings):
     cameras = {name: short_scene.drive.cameras[name] for name in CAMERAS}
     rig = initial_rig(cameras, sightings.map_from_vehicle)
-    start = [extrinsic_from_ipm(one.info, one.ipm[one.initial_ipm]) for one in cameras.values()]
+    start = [extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm]) for camera in cameras.values()]
     np.testing.assert_allclose(rig.cam_from_vehicle, start, atol=1e-12)
     located = locate(sightings, rig)
     by_numpy = ipm.apply_in_front(homographies(sightings, rig), sightings.corners_pinhole_px)

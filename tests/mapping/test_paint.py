@@ -20,22 +20,22 @@ def test_the_scale_and_tails_of_the_deviations_are_found_again():
     rng = np.random.default_rng(0)
     scale = 0.003 * np.sqrt(4.0 / rng.chisquare(4.0, 2000))
     deviations = [rng.normal(0.0, np.hypot(sigma, 0.001), 5) for sigma in scale]
-    found = learn_paint_error(deviations, [FORMAL] * len(deviations))
-    assert found.sigma_m == pytest.approx(0.003, rel=0.15)
-    assert 3.0 < found.freedom < 7.0
+    paint_error = learn_paint_error(deviations, [FORMAL] * len(deviations))
+    assert paint_error.sigma_m == pytest.approx(0.003, rel=0.15)
+    assert 3.0 < paint_error.freedom < 7.0
 
 
 def test_paint_without_errors_of_its_own_adds_hardly_anything():
     rng = np.random.default_rng(1)
     deviations = [rng.normal(0.0, 0.001, 5) for _ in range(500)]
-    found = learn_paint_error(deviations, [FORMAL] * 500)
-    assert found.sigma_m < 0.0005
+    paint_error = learn_paint_error(deviations, [FORMAL] * 500)
+    assert paint_error.sigma_m < 0.0005
 
 
 def test_a_marking_far_from_its_class_is_known_as_badly_as_it_deviates():
     paint = PaintError(0.001, 2.0)
-    near, far = (paint.variance_m2(off * np.ones(5), FORMAL) for off in (0.001, 0.03))
-    assert np.sqrt(near) == pytest.approx(np.sqrt(2 / 7) * 0.001)  # its formal sigma explains the deviation
+    alike, far = (paint.variance_m2(off * np.ones(5), FORMAL) for off in (0.001, 0.03))
+    assert np.sqrt(alike) == pytest.approx(np.sqrt(2 / 7) * 0.001)  # its formal sigma explains the deviation
     assert np.sqrt(far) == pytest.approx(0.03 * np.sqrt(5 / 7), rel=0.02)
 
 
@@ -80,24 +80,32 @@ def image(pose, rng):
             grey[within & left], grey[within & ~left] = 140.0, 40.0
         elif number != GONE:
             low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
-            near = np.flatnonzero(((grid > low) & (grid < high)).all(axis=1))
+            near_pixels = np.flatnonzero(((grid > low) & (grid < high)).all(axis=1))
             sides = np.roll(corners, -1, axis=0) - corners
-            off = grid[near][:, None] - corners
+            off = grid[near_pixels][:, None] - corners
             inside = (sides[:, 0] * off[..., 1] - sides[:, 1] * off[..., 0] < 0).all(axis=1)
-            grey[near[inside]] = rng.normal(130.0, 5.0, int(inside.sum()))
+            grey[near_pixels[inside]] = rng.normal(130.0, 5.0, int(inside.sum()))
     return np.asarray(grey.reshape(720, 1280), dtype=np.float32)
 
 
 @pytest.fixture(scope="module")
 def observer():
     rng, route = np.random.default_rng(0), poses()
-    made = {k: image(route[k], rng) for k in range(len(route))}
+    grey_images = {k: image(route[k], rng) for k in range(len(route))}
     frames, none = np.arange(len(route)), np.zeros(0, dtype=np.int64)
-    seen = none, none, none, none, np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros((0, 4), dtype=bool)
-    rest = ("diamond",), np.zeros_like(frames), np.zeros((0, 4)), np.zeros(0)
-    sightings = Sightings(("front",), 0.1 * frames, route, *seen, *rest)
+    pixel_fields = (
+        none,
+        none,
+        none,
+        none,
+        np.zeros((0, 4, 2)),
+        np.zeros((0, 4, 2, 2)),
+        np.zeros((0, 4), dtype=bool),
+    )
+    other_fields = ("diamond",), np.zeros_like(frames), np.zeros((0, 4)), np.zeros(0)
+    sightings = Sightings(("front",), 0.1 * frames, route, *pixel_fields, *other_fields)
     views, rig = Views(frames, np.zeros_like(frames), frames), Rig(INTRINSIC[None], MOUNT[None], route)
-    return Observer(sightings, views, (CAMERA,), rig, 0.0, made.__getitem__)
+    return Observer(sightings, views, (CAMERA,), rig, 0.0, grey_images.__getitem__)
 
 
 def contrasts_of(observer):

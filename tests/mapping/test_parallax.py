@@ -22,9 +22,9 @@ def sighted(way_m, corners_m, height_m=0.0, moved_m=0.0, seed=0):
     """
     rng = np.random.default_rng(seed)
     centre = np.column_stack([way_m, np.zeros(len(way_m))])
-    there = corners_m + np.stack(np.broadcast_arrays(moved_m, 0.0), axis=-1).reshape(-1, 1, 2)
+    true_corners_m = corners_m + np.stack(np.broadcast_arrays(moved_m, 0.0), axis=-1).reshape(-1, 1, 2)
     scale = HEIGHT_M / (HEIGHT_M - np.broadcast_to(height_m, 4))[:, None]
-    ray = (there - centre[:, None]) * scale
+    ray = (true_corners_m - centre[:, None]) * scale
     covariance = direction_covariance(ray, np.full(ray.shape[:2], HEIGHT_M), PIXEL_RAD)
     off = np.einsum("npij,npj->npi", np.linalg.cholesky(covariance), rng.standard_normal(ray.shape))
     pitch = rng.normal(0.0, POSE_SIGMA[3], (len(way_m), 1, 1))
@@ -56,9 +56,10 @@ def test_a_metre_of_way_tells_paint_from_a_plane_one_metre_higher(seed):
 
 def test_the_slope_errs_as_stated():
     way_m = np.linspace(0.0, 2.0, 8)
-    found = [measure_parallax(sighted(way_m, AHEAD + QUAD, seed=seed), 1) for seed in range(60)]
+    measured = [measure_parallax(sighted(way_m, AHEAD + QUAD, seed=seed), 1) for seed in range(60)]
     squared = [
-        ((one.slope[0] - 1.0) @ np.linalg.solve(one.covariance[0], one.slope[0] - 1.0)) / 4 for one in found
+        ((parallax.slope[0] - 1.0) @ np.linalg.solve(parallax.covariance[0], parallax.slope[0] - 1.0)) / 4
+        for parallax in measured
     ]
     assert 0.7 < np.mean(squared) < 1.5
 
@@ -135,13 +136,13 @@ def test_of_many_candidates_each_has_the_odds_that_it_has_alone():
 
 def test_corners_that_were_not_used_say_nothing():
     views = sighted(np.linspace(0.0, 2.0, 8), AHEAD + QUAD)
-    known = measure_parallax(views, 1)
+    of_all_views = measure_parallax(views, 1)
     views.used[:, 3] = False
     views.points_map[:, 3], views.covariance_m2[:, 3] = np.nan, np.nan
     fewer = measure_parallax(views, 1)
-    assert fewer.slope[0, :3] == pytest.approx(known.slope[0, :3], abs=0.05)
+    assert fewer.slope[0, :3] == pytest.approx(of_all_views.slope[0, :3], abs=0.05)
     assert fewer.covariance[0, 3, 3] > 50 > 0.1 > fewer.covariance[0, 0, 0]
-    assert 2 < fewer.log_odds[0] < known.log_odds[0]
+    assert 2 < fewer.log_odds[0] < of_all_views.log_odds[0]
 
 
 def test_a_candidate_without_any_image_is_not_observed():

@@ -19,31 +19,37 @@ from v2hdm.records import DIAMOND, HDMap, ImageDetections
 CAMERAS = ("front", "rear")
 
 
-def cut_short(seen, rng):
+def cut_short(detection, rng):
     """A dash of which one end is hidden: it seems to end earlier, where nothing is known along it."""
-    corners, covariance, valid = seen.corners_px.copy(), seen.covariance_px.copy(), seen.corner_valid.copy()
+    corners, covariance, valid = (
+        detection.corners_px.copy(),
+        detection.covariance_px.copy(),
+        detection.corner_valid.copy(),
+    )
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     k = int(np.argmax(sides[:2] + sides[2:]))
     ends = [(k, (k + 1) % 4), ((k + 3) % 4, (k + 2) % 4)]
     share, turned = rng.uniform(0.2, 0.8), bool(rng.integers(2))
     for pair in ends:
-        hidden, kept = pair[::-1] if turned else pair
-        along = corners[hidden] - corners[kept]
-        corners[hidden] = corners[kept] + share * along
+        hidden, visible = pair[::-1] if turned else pair
+        along = corners[hidden] - corners[visible]
+        corners[hidden] = corners[visible] + share * along
         along = along / np.linalg.norm(along)
         rows = slice(2 * hidden, 2 * hidden + 2)
         covariance[rows, rows] += rng.uniform(100, 1000) ** 2 * np.outer(along, along)
         valid[hidden] = False
-    return replace(seen, corners_px=corners, covariance_px=covariance, corner_valid=valid)
+    return replace(detection, corners_px=corners, covariance_px=covariance, corner_valid=valid)
 
 
-def both_ends_hidden(seen, rng):
+def both_ends_hidden(detection, rng):
     """A dash of which nothing but the sides is known."""
-    sides = np.roll(seen.corners_px, -1, axis=0) - seen.corners_px
+    sides = np.roll(detection.corners_px, -1, axis=0) - detection.corners_px
     along = sides[np.argmax(np.linalg.norm(sides, axis=1))]
     along = along / np.linalg.norm(along)
-    covariance = seen.covariance_px + rng.uniform(100, 1000) ** 2 * np.kron(np.eye(4), np.outer(along, along))
-    return replace(seen, covariance_px=covariance, corner_valid=np.zeros(4, dtype=bool))
+    covariance = detection.covariance_px + rng.uniform(100, 1000) ** 2 * np.kron(
+        np.eye(4), np.outer(along, along)
+    )
+    return replace(detection, covariance_px=covariance, corner_valid=np.zeros(4, dtype=bool))
 
 
 def with_cut_dashes(scene, share, cut=cut_short):
@@ -53,7 +59,9 @@ def with_cut_dashes(scene, share, cut=cut_short):
     def seen(m):
         return cut(m, rng) if m.kind == "lane_dash" and m.corner_valid.all() and rng.random() < share else m
 
-    return [replace(found, markings=tuple(seen(m) for m in found.markings)) for found in scene.detections]
+    return [
+        replace(in_image, markings=tuple(seen(m) for m in in_image.markings)) for in_image in scene.detections
+    ]
 
 
 STREET = SceneOptions(length_m=45.0, seed=3, false_rate=0.0, wild_rate=0.0, hidden_corner_rate=0.0)
@@ -86,8 +94,8 @@ def test_corners_on_a_line_inform_and_are_no_points_and_those_without_covariance
 def test_a_dash_of_which_every_image_hides_an_end_is_mapped_as_a_whole(scene):
     detections = with_cut_dashes(scene, 0.6)
     whole, cut = (
-        run_methods(scene.drive, found, CAMERAS, MappingOptions(pose_model="heave"))["Opt"]
-        for found in (scene.detections, detections)
+        run_methods(scene.drive, detections_of_run, CAMERAS, MappingOptions(pose_model="heave"))["Opt"]
+        for detections_of_run in (scene.detections, detections)
     )
     dashes = [len([m for m in result.hd_map.markings if m.kind == "lane_dash"]) for result in (whole, cut)]
     assert dashes[1] >= dashes[0] - 1
@@ -96,8 +104,8 @@ def test_a_dash_of_which_every_image_hides_an_end_is_mapped_as_a_whole(scene):
     assert rmse_m < match(whole.hd_map, scene.markings, MATCH_M)[1] + 0.01
     assert cut.reprojection_rmse_px == pytest.approx(whole.reprojection_rmse_px, rel=0.3)
     incremental = run_methods(scene.drive, detections, CAMERAS, MappingOptions(mode="incremental"))["Opt"]
-    found, grown_rmse_m = match(incremental.hd_map, scene.markings, MATCH_M)
-    assert len(found) >= len(pairs) - 3
+    matches, grown_rmse_m = match(incremental.hd_map, scene.markings, MATCH_M)
+    assert len(matches) >= len(pairs) - 3
     assert grown_rmse_m < rmse_m + 0.03
 
 
@@ -148,14 +156,14 @@ def test_sides_without_ends_are_attached_to_the_dash_that_they_are_of(scene):
     optimiser = optimiser_of(scene, sightings, MappingOptions())
     tracks, located = optimiser.initial_tracks(), locate(sightings, rig)
     fused = fuse_groups(tracks, located, 0.002)
-    found = attach(tracks, sightings, located, rig, fused, 0.002)
-    new = np.flatnonzero((found.group >= 0) & (tracks.group < 0))
+    attached = attach(tracks, sightings, located, rig, fused, 0.002)
+    new = np.flatnonzero((attached.group >= 0) & (tracks.group < 0))
     lines = np.flatnonzero((sightings.informs & ~sightings.valid).all(axis=1))
     assert np.isin(lines, new).mean() > 0.3
     centres = locate(whole, rig).corners_map[new].mean(axis=1)
-    apart = np.linalg.norm(fused.corners_map[found.group[new]].mean(axis=1) - centres, axis=1)
-    assert (apart < 1.0).mean() > 0.98
-    shown = np.stack([found.group, sightings.image])[:, found.group >= 0]
+    distances_m = np.linalg.norm(fused.corners_map[attached.group[new]].mean(axis=1) - centres, axis=1)
+    assert (distances_m < 1.0).mean() > 0.98
+    shown = np.stack([attached.group, sightings.image])[:, attached.group >= 0]
     assert len(np.unique(shown, axis=1).T) == len(shown.T)
 
 
@@ -165,34 +173,34 @@ STOP_LINE = np.array([[0.0, 1.5], [-0.4, 1.5], [-0.4, -1.5], [0.0, -1.5]])
 
 def with_a_stop_line(markings):
     """A stop line in the place of the diamond nearest to the way, where the street begins."""
-    near = min(
+    nearest = min(
         range(len(markings)), key=lambda k: float(np.linalg.norm(markings[k].corners_map[0] - [12, 4]))
     )
     turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
-    corners = markings[near].corners_map.mean(axis=0) + STOP_LINE @ turn.T
-    out = [m for k, m in enumerate(markings) if k != near]
-    return [*out, replace(markings[near], kind="stop_line", corners_map=corners)]
+    corners = markings[nearest].corners_map.mean(axis=0) + STOP_LINE @ turn.T
+    out = [m for k, m in enumerate(markings) if k != nearest]
+    return [*out, replace(markings[nearest], kind="stop_line", corners_map=corners)]
 
 
-def crossed(seen, is_left):
+def crossed(detection, is_left):
     """The half of a stop line that lies on one side of an arrow, which ends where that begins."""
-    corners = seen.corners_px.astype(np.float32)
+    corners = detection.corners_px.astype(np.float32)
     # Seen anticlockwise from above, whichever corner comes first; only the nearer or farther end is left.
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     k = int(np.argmax(sides[:2] + sides[2:]))
     flat = np.roll(np.array([[0, 0], [3, 0], [3, 0.4], [0, 0.4]], np.float32), k, axis=0)
-    kept = np.array([[0, 0], [1.4, 0], [1.4, 0.4], [0, 0.4]], np.float32)
+    kept_part = np.array([[0, 0], [1.4, 0], [1.4, 0.4], [0, 0.4]], np.float32)
     cut = np.array([False, True, True, False])
     if not is_left:
-        kept, cut = np.array([[1.6, 0], [3, 0], [3, 0.4], [1.6, 0.4]], np.float32), ~cut
+        kept_part, cut = np.array([[1.6, 0], [3, 0], [3, 0.4], [1.6, 0.4]], np.float32), ~cut
     image_from_flat = cv2.getPerspectiveTransform(flat, corners)
-    at = cv2.perspectiveTransform(np.roll(kept, k, axis=0)[:, None], image_from_flat)[:, 0]
-    covariance, valid = seen.covariance_px.copy(), ~np.roll(cut, k)
+    at = cv2.perspectiveTransform(np.roll(kept_part, k, axis=0)[:, None], image_from_flat)[:, 0]
+    covariance, valid = detection.covariance_px.copy(), ~np.roll(cut, k)
     for end in np.flatnonzero(~valid):
         along = corners[end] - corners[(end + 1) % 4 if valid[(end + 1) % 4] else (end + 3) % 4]
         rows = slice(2 * end, 2 * end + 2)
         covariance[rows, rows] += 12.0**2 * np.outer(along, along) / (along @ along)
-    return replace(seen, corners_px=at.astype(float), covariance_px=covariance, corner_valid=valid)
+    return replace(detection, corners_px=at.astype(float), covariance_px=covariance, corner_valid=valid)
 
 
 def stop_lines(whole_images):
@@ -200,24 +208,24 @@ def stop_lines(whole_images):
     scene = make_scene(STREET, with_a_stop_line)
     left = dict.fromkeys(CAMERAS, whole_images)
     detections = []
-    for found in scene.detections[::-1]:
-        name, markings = scene.drive.images[found.image].camera, []
-        for seen in found.markings:
-            if seen.kind != "stop_line" or (seen.corner_valid.all() and left[name] > 0):
-                markings.append(seen)
-                left[name] -= seen.kind == "stop_line"
-            elif seen.corner_valid.all():
-                markings += [crossed(seen, True), crossed(seen, False)]
-        detections.append(replace(found, markings=tuple(markings)))
+    for in_image in scene.detections[::-1]:
+        name, markings = scene.drive.images[in_image.image].camera, []
+        for detection in in_image.markings:
+            if detection.kind != "stop_line" or (detection.corner_valid.all() and left[name] > 0):
+                markings.append(detection)
+                left[name] -= detection.kind == "stop_line"
+            elif detection.corner_valid.all():
+                markings += [crossed(detection, True), crossed(detection, False)]
+        detections.append(replace(in_image, markings=tuple(markings)))
     mapped = run_methods(scene.drive, detections[::-1], CAMERAS, MappingOptions(pose_model="heave"))["Opt"]
     true = next(m for m in scene.markings if m.kind == "stop_line")
     return [m for m in mapped.hd_map.markings if m.kind == "stop_line"], true
 
 
 def test_a_stop_line_that_an_arrow_cuts_in_most_images_has_the_ends_that_the_others_show():
-    (found,), true = stop_lines(whole_images=1)
+    (mapped_line,), true = stop_lines(whole_images=1)
     off = min(
-        np.linalg.norm(np.roll(found.corners_map, k, axis=0) - true.corners_map, axis=1).max()
+        np.linalg.norm(np.roll(mapped_line.corners_map, k, axis=0) - true.corners_map, axis=1).max()
         for k in range(4)
     )
     assert off < 0.05
@@ -242,18 +250,18 @@ def mapped(yard, detections):
 
 def errors_m(yard, hd_map):
     """The largest corner error of each marking that is there, and how many are not."""
-    centres = np.array([one.corners_map.mean(axis=0) for one in yard.markings])
-    found, false = [], 0
-    for one in hd_map.markings:
-        i = int(np.linalg.norm(centres - one.corners_map.mean(axis=0), axis=1).argmin())
+    centres = np.array([marking.corners_map.mean(axis=0) for marking in yard.markings])
+    errors_found_m, false = [], 0
+    for marking in hd_map.markings:
+        i = int(np.linalg.norm(centres - marking.corners_map.mean(axis=0), axis=1).argmin())
         true = yard.markings[i]
-        rolled = [np.roll(one.corners_map, k, axis=0) - true.corners_map for k in range(4)]
-        off_m = min(float(np.linalg.norm(each, axis=1).max()) for each in rolled)
-        if true.kind != one.kind or off_m > 0.3:
+        rolled = [np.roll(marking.corners_map, k, axis=0) - true.corners_map for k in range(4)]
+        off_m = min(float(np.linalg.norm(difference, axis=1).max()) for difference in rolled)
+        if true.kind != marking.kind or off_m > 0.3:
             false += 1
         else:
-            found.append(off_m)
-    return np.array(found), false
+            errors_found_m.append(off_m)
+    return np.array(errors_found_m), false
 
 
 @pytest.fixture(scope="module")
@@ -263,15 +271,15 @@ def clean_m(yard):
 
 
 def with_paint(yard, more):
-    return [replace(one, markings=(*one.markings, *more(one))) for one in yard.detections]
+    return [replace(in_image, markings=(*in_image.markings, *more(in_image))) for in_image in yard.detections]
 
 
 def anywhere(yard, share):
     """So many of all detections are diamonds anywhere in the image."""
     rng = np.random.default_rng(8)
 
-    def more(seen):
-        count = rng.poisson(len(seen.markings) * share / (1 - share))
+    def more(in_image):
+        count = rng.poisson(len(in_image.markings) * share / (1 - share))
         places = rng.uniform([100, 320], [1180, 680], (count, 2))
         shape = np.array([[30.0, 0], [0, -15], [-30, 0], [0, 15]])
         return [
@@ -286,8 +294,8 @@ def on_a_truck(yard, ahead_m, gains_m):
     """A diamond, flat on a low trailer at the height of the ground, that drives ahead and draws away."""
     rng = np.random.default_rng(9)
 
-    def more(seen):
-        image = yard.drive.images[seen.image]
+    def more(in_image):
+        image = yard.drive.images[in_image.image]
         vehicle = _DIAMOND_M + np.array([ahead_m + gains_m * image.stamp_s, 0.4, 0.0])
         matrix = image.map_from_vehicle
         on_map = vehicle @ matrix[:3, :3].T + matrix[:3, 3]
@@ -309,9 +317,11 @@ SPOILT: dict[str, Callable[[Scene], list[ImageDetections]]] = {
 @pytest.mark.parametrize("name", SPOILT)
 def test_false_and_moving_paint_stays_out_of_the_map(yard, clean_m, name):
     detections = SPOILT[name](yard)
-    added = sum(len(one.markings) for one in detections) - sum(len(one.markings) for one in yard.detections)
+    added = sum(len(in_image.markings) for in_image in detections) - sum(
+        len(in_image.markings) for in_image in yard.detections
+    )
     assert added > 20
-    found, false = errors_m(yard, mapped(yard, detections))
+    off_m, false = errors_m(yard, mapped(yard, detections))
     assert false == 0
-    assert len(found) >= len(clean_m) - 1
-    assert np.sqrt(np.mean(found**2)) < 1.3 * np.sqrt(np.mean(clean_m**2))
+    assert len(off_m) >= len(clean_m) - 1
+    assert np.sqrt(np.mean(off_m**2)) < 1.3 * np.sqrt(np.mean(clean_m**2))

@@ -18,7 +18,7 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, SizeOptions
 from v2hdm.mapping.results import NO_SEGMENT, MethodResult
-from v2hdm.mapping.sections import run
+from v2hdm.mapping.sections import run, work
 from v2hdm.mapping.sections.common import Names, named, with_owners
 from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
 from v2hdm.mapping.sections.joint import (
@@ -29,6 +29,7 @@ from v2hdm.mapping.sections.joint import (
     refuse_contradicting_drives,
     scatter_by_marking,
 )
+from v2hdm.mapping.sections.ours import Pairs
 from v2hdm.mapping.sections.run import map_in_sections
 from v2hdm.mapping.sections.section import sections_of
 from v2hdm.mapping.sections.work import Work
@@ -81,9 +82,9 @@ def whole(scene) -> MethodResult:
 
 def test_sections_have_every_image_once_as_their_own(scene):
     sections = sections_of(scene.drive, 65.0)
-    own = np.concatenate([section.images[section.is_own] for section in sections])
+    numbers = np.concatenate([section.images[section.is_own] for section in sections])
     assert len(sections) == 2
-    np.testing.assert_array_equal(np.sort(own), np.arange(len(scene.drive.images)))
+    np.testing.assert_array_equal(np.sort(numbers), np.arange(len(scene.drive.images)))
     assert all(not section.is_own.all() for section in sections)
 
 
@@ -110,6 +111,21 @@ def test_the_map_is_that_of_the_drive(result, whole):
         np.testing.assert_allclose(sigma, 1.0, atol=0.01)
 
 
+def test_a_map_is_the_same_where_every_section_solves_for_all_that_it_shows(
+    scene, result, tmp_path, monkeypatch
+):
+    """Otherwise a section solves for its own candidates alone, and for each column of these once."""
+    none = np.zeros(0, dtype=np.int64)
+    monkeypatch.setattr(work, "of_ours", lambda final, is_ours: final)
+    monkeypatch.setattr(work, "near_corners", lambda bundle, is_ours: Pairs(none, none))
+    slowly = in_sections(scene, tmp_path)
+    assert len(slowly.hd_map.markings) == len(result.hd_map.markings)
+    for marking, other in zip(result.hd_map.markings, slowly.hd_map.markings, strict=True):
+        np.testing.assert_allclose(marking.corners_map, other.corners_map, atol=1e-9)
+        np.testing.assert_allclose(marking.covariance_m2, other.covariance_m2, rtol=1e-5, atol=1e-12)
+        np.testing.assert_allclose(marking.relative_sigma_m, other.relative_sigma_m, rtol=1e-5)
+
+
 def test_no_marking_is_mapped_twice(result):
     centres = np.array([marking.corners_map.mean(axis=0) for marking in result.hd_map.markings])
     nearest_m, _ = cKDTree(centres).query(centres, k=2)
@@ -132,8 +148,8 @@ def test_what_goes_with_the_map_is_of_the_whole_drive(scene, result, whole):
 def test_a_section_without_a_marking_is_named_in_one_line(scene, tmp_path):
     first = sections_of(scene.drive, 65.0)[0].images
     bare = [
-        replace(found, markings=()) if found.image in set(first.tolist()) else found
-        for found in scene.detections
+        replace(in_image, markings=()) if in_image.image in set(first.tolist()) else in_image
+        for in_image in scene.detections
     ]
     with pytest.raises(
         MappingError, match=r"section \d, about x .* m, y .* m: no markings were found"

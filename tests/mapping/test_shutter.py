@@ -28,7 +28,9 @@ def mapped(drive, detections, **options):
 
 
 def unstated(drive):
-    return replace(drive, cameras={name: replace(one, read_out_s=0.0) for name, one in drive.cameras.items()})
+    return replace(
+        drive, cameras={name: replace(camera, read_out_s=0.0) for name, camera in drive.cameras.items()}
+    )
 
 
 def test_sightings_lie_where_the_pose_of_their_row_puts_them(scene):
@@ -39,12 +41,12 @@ def test_sightings_lie_where_the_pose_of_their_row_puts_them(scene):
     sightings = collect_sightings(exact.drive, exact.detections, CAMERAS)
     truth = np.stack([exact.cam_from_vehicle[name] for name in CAMERAS])
     rig = replace(initial_rig(exact.drive.cameras, sightings.map_from_vehicle), cam_from_vehicle=truth)
-    corners = np.concatenate([one.corners_map for one in exact.markings])
+    corners = np.concatenate([marking.corners_map for marking in exact.markings])
 
     def off_m(some):
         located = locate(sightings, some)
-        near = located.valid & (located.range_m < 10.0)
-        away = np.linalg.norm(located.corners_map[near][:, None] - corners, axis=2).min(axis=1)
+        is_near = located.valid & (located.range_m < 10.0)
+        away = np.linalg.norm(located.corners_map[is_near][:, None] - corners, axis=2).min(axis=1)
         return np.quantile(away, 0.95)
 
     moving = rolling(rig, exact.drive.cameras.values(), sightings, estimate=False)

@@ -27,7 +27,7 @@ def painted(shapes, rng):
     turn = rng.uniform(0, 2 * np.pi, len(shapes))
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).transpose(2, 0, 1)
     placed = np.stack(shapes) @ rotation.transpose(0, 2, 1) + np.arange(len(shapes))[:, None, None] * [5.0, 0]
-    return np.stack([np.roll(one, int(rng.integers(4)), axis=0) for one in placed])
+    return np.stack([np.roll(corners, int(rng.integers(4)), axis=0) for corners in placed])
 
 
 def solved(true, rng, sigma_m=0.01):
@@ -60,9 +60,9 @@ def of_one_class(candidates, counts=None):
 
 def without(candidates, place, corners):
     """The candidates, of which one has ``corners`` that nobody saw."""
-    seen, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
-    seen[place, corners] = np.nan
-    return Candidates.seen(seen, covariance)
+    corners_map, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
+    corners_map[place, corners] = np.nan
+    return Candidates.seen(corners_map, covariance)
 
 
 def shape_rmse(corners, true):
@@ -71,26 +71,26 @@ def shape_rmse(corners, true):
     return float(np.sqrt(np.mean(np.sum((error - error.mean(axis=1, keepdims=True)) ** 2, axis=2))))
 
 
-def normalised(found, true):
+def normalised(posterior, true):
     """Squared errors (N,) of all eight coordinates, in the stated covariance."""
-    error = (found.candidates.corners_map - true).reshape(-1, 8, 1)
-    return (error.transpose(0, 2, 1) @ np.linalg.solve(found.candidates.covariance_m2, error))[:, 0, 0]
+    error = (posterior.candidates.corners_map - true).reshape(-1, 8, 1)
+    return (error.transpose(0, 2, 1) @ np.linalg.solve(posterior.candidates.covariance_m2, error))[:, 0, 0]
 
 
 @pytest.mark.parametrize("shape", [DIAMOND, DASH])
 def test_markings_of_one_stencil_lend_one_another_their_accuracy(shape):
     true, candidates = row(0, [shape] * 60, 0.02)
-    found = of_one_class(candidates)
-    assert shape_rmse(found.candidates.corners_map, true) < 0.7 * shape_rmse(candidates.corners_map, true)
-    assert normalised(found, true).mean() / 8 < 1.1
-    assert (found.log_odds > 5).all()
+    posterior = of_one_class(candidates)
+    assert shape_rmse(posterior.candidates.corners_map, true) < 0.7 * shape_rmse(candidates.corners_map, true)
+    assert normalised(posterior, true).mean() / 8 < 1.1
+    assert (posterior.log_odds > 5).all()
 
 
 def test_a_corner_that_nobody_saw_is_where_the_class_has_it():
     true, candidates = row(1, [DIAMOND] * 30)
-    found = of_one_class(without(candidates, 4, [2]))
-    assert np.linalg.norm(found.candidates.corners_map[4] - true[4], axis=1).max() < 0.08
-    assert normalised(found, true)[4] < 20
+    posterior = of_one_class(without(candidates, 4, [2]))
+    assert np.linalg.norm(posterior.candidates.corners_map[4] - true[4], axis=1).max() < 0.08
+    assert normalised(posterior, true)[4] < 20
 
 
 def test_a_corner_on_a_known_line_is_found_along_it():
@@ -102,36 +102,36 @@ def test_a_corner_on_a_known_line_is_found_along_it():
         candidates.corners_map[4, corner] -= 1.2 * along
         rows = slice(2 * corner, 2 * corner + 2)
         candidates.covariance_m2[4, rows, rows] += 5.0**2 * np.outer(along, along)
-    found = of_one_class(candidates)
-    assert np.linalg.norm(found.candidates.corners_map[4] - true[4], axis=1).max() < 0.08
-    assert found.probability[4, Kind.OF_CLASS] > 0.5
+    posterior = of_one_class(candidates)
+    assert np.linalg.norm(posterior.candidates.corners_map[4] - true[4], axis=1).max() < 0.08
+    assert posterior.probability[4, Kind.OF_CLASS] > 0.5
 
 
 def test_a_corner_taken_for_another_edge_is_put_where_the_shape_has_it():
     true, candidates = row(3, [DIAMOND] * 40)
     candidates.corners_map[7, 2] += 0.4 * (true[7, 2] - true[7].mean(axis=0))
-    found = of_one_class(candidates)
-    assert np.linalg.norm(found.candidates.corners_map[7] - true[7], axis=1).max() < 0.08
+    posterior = of_one_class(candidates)
+    assert np.linalg.norm(posterior.candidates.corners_map[7] - true[7], axis=1).max() < 0.08
 
 
 def test_a_dash_of_another_length_keeps_it_where_longer_ones_tell_that_lengths_differ():
     rng = np.random.default_rng(4)
     lengths = [1.0] * 34 + [0.9, 0.92, 0.94, 1.06, 1.08, 1.1]
     true = painted([DASH * [length, 1.0] for length in lengths], rng)
-    found = of_one_class(solved(true, rng, 0.005))
-    sides = np.linalg.norm(np.diff(found.candidates.corners_map, axis=1), axis=2).max(axis=1)
+    posterior = of_one_class(solved(true, rng, 0.005))
+    sides = np.linalg.norm(np.diff(posterior.candidates.corners_map, axis=1), axis=2).max(axis=1)
     np.testing.assert_allclose(sides, 3.0 * np.array(lengths), atol=0.08)
-    assert (normalised(found, true) < 25).all()
+    assert (normalised(posterior, true) < 25).all()
 
 
 def test_a_worn_end_is_not_taken_for_the_end_of_the_paint():
     true, candidates = row(5, [DASH] * 60, 0.005)
     for worn, share in ((10, 0.07), (20, 0.12), (30, 0.16), (40, 0.22)):
         wear_off(candidates, true, worn, share, 0.03)
-    found = of_one_class(candidates)
-    error = np.linalg.norm(found.candidates.corners_map - true, axis=2)
-    assert (error < 3 * found.candidates.sigma_m).all()
-    assert (found.log_odds > 5).all()
+    posterior = of_one_class(candidates)
+    error = np.linalg.norm(posterior.candidates.corners_map - true, axis=2)
+    assert (error < 3 * posterior.candidates.sigma_m).all()
+    assert (posterior.log_odds > 5).all()
 
 
 def wear_off(candidates, true, place, share, sigma_m=0.0):
@@ -162,7 +162,7 @@ def test_a_length_that_several_dashes_have_is_no_wear():
         for count in (1, 5)
     )
     probabilities = (of_one_class(candidates).probability[50:] for candidates in (alone, repeated))
-    others = [each[:, Kind.OTHER_LENGTH] for each in probabilities]
+    others = [probability[:, Kind.OTHER_LENGTH] for probability in probabilities]
     assert others[1].min() > 0.98 > 0.96 > others[0].max()
 
 
@@ -174,11 +174,11 @@ def test_two_ends_that_most_views_know_to_be_hidden_are_no_other_length():
         before = candidates.corners_map[place].copy()
         wear_off(candidates, true, place, 0.25)
         counts.pointed[place, np.abs(candidates.corners_map[place] - before).max(axis=1) > 0.1] = 2
-    unknown, known = of_one_class(candidates), of_one_class(candidates, counts)
+    unknown, with_counts = of_one_class(candidates), of_one_class(candidates, counts)
     assert unknown.probability[[10, 20], Kind.OTHER_LENGTH].min() > 0.5
-    assert known.probability[[10, 20], Kind.WRONG_END].min() > 0.75
-    error = np.linalg.norm(known.candidates.corners_map - true, axis=2)
-    assert (error < 3 * known.candidates.sigma_m).all()
+    assert with_counts.probability[[10, 20], Kind.WRONG_END].min() > 0.75
+    error = np.linalg.norm(with_counts.candidates.corners_map - true, axis=2)
+    assert (error < 3 * with_counts.candidates.sigma_m).all()
 
 
 def moved_end(candidates, place, along, slant=0.0):
@@ -193,8 +193,10 @@ def moved_end(candidates, place, along, slant=0.0):
 def test_a_piece_of_a_dash_is_no_short_dash_and_an_end_that_runs_on_into_a_stroke_is_no_end(seed, moved):
     true, candidates = row(seed, [DASH] * 30, 0.005)
     moved_end(candidates, 12, *moved)
-    found = of_one_class(candidates)
-    assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
+    posterior = of_one_class(candidates)
+    assert (
+        np.linalg.norm(posterior.candidates.corners_map - true, axis=2) < 3 * posterior.candidates.sigma_m
+    ).all()
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -204,13 +206,13 @@ def test_four_dashes_with_worn_ends_tell_that_a_fifth_is_a_piece(seed):
     for place, share in enumerate((-0.02, 0.01, 0.03, -0.01)):
         wear_off(candidates, true, place, share, 0.1)
     moved_end(candidates, 4, -0.75)
-    found = of_one_class(candidates)
-    piece_m, sigma_m = found.candidates.corners_map[4], found.candidates.sigma_m[4]
+    posterior = of_one_class(candidates)
+    piece_m, sigma_m = posterior.candidates.corners_map[4], posterior.candidates.sigma_m[4]
     assert (np.linalg.norm(piece_m - true[4], axis=1) < 3 * sigma_m).all()
-    assert found.probability[4, Kind.WRONG_END] > 0.8
+    assert posterior.probability[4, Kind.WRONG_END] > 0.8
     assert sigma_m.max() > 0.3
-    assert (found.probability[:4, Kind.OF_CLASS] > 0.5).all()
-    assert (normalised(found, true) < 25).all()
+    assert (posterior.probability[:4, Kind.OF_CLASS] > 0.5).all()
+    assert (normalised(posterior, true) < 25).all()
 
 
 DASHES = {0: STANDARD_M[LANE_DASH]}
@@ -227,14 +229,14 @@ def test_a_dash_that_may_have_lost_an_end_is_not_certain_beside_so_few_others(ot
     """Three of four metres are gone, and no class of three or more tells so."""
     true, candidates = row(others, [DASH] * (others + 1), 0.01)
     moved_end(candidates, others, -0.75)
-    found = among_few(candidates)
-    error_m = np.linalg.norm(found.candidates.corners_map - true, axis=2).max(axis=1)
-    sigma_m = found.candidates.sigma_m.max(axis=1)
+    posterior = among_few(candidates)
+    error_m = np.linalg.norm(posterior.candidates.corners_map - true, axis=2).max(axis=1)
+    sigma_m = posterior.candidates.sigma_m.max(axis=1)
     assert sigma_m[others] > 0.6
     assert error_m[others] < 3.1 * sigma_m[others]
     assert (error_m[:others] < 0.05).all()
     assert (sigma_m[:others] < 0.15).all()
-    assert (found.log_odds > 5).all()
+    assert (posterior.log_odds > 5).all()
 
 
 @pytest.mark.parametrize("length_m", [1.0, 2.0, 3.0, 6.0])
@@ -242,18 +244,18 @@ def test_a_dash_of_a_standard_length_keeps_it_alone_and_is_known_better_beside_a
     sigmas_m = []
     for count in (1, 2):
         true, candidates = row(3, [DASH * [length_m / 3, 1.0]] * count, 0.01)
-        found = among_few(candidates)
-        sigmas_m.append(found.candidates.sigma_m.max())
-        assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 0.05).all()
+        posterior = among_few(candidates)
+        sigmas_m.append(posterior.candidates.sigma_m.max())
+        assert (np.linalg.norm(posterior.candidates.corners_map - true, axis=2) < 0.05).all()
     assert 0.15 > sigmas_m[0] > sigmas_m[1]
     assert sigmas_m[1] < 0.08
 
 
 def test_what_most_dashes_show_of_their_length_counts_for_more_than_standards():
     true, candidates = row(4, [DASH * [0.75 / 3, 1.0]] * 2, 0.01)
-    found = among_few(candidates)
-    assert found.candidates.sigma_m.max() < 0.1
-    assert shape_rmse(found.candidates.corners_map, true) < 0.02
+    posterior = among_few(candidates)
+    assert posterior.candidates.sigma_m.max() < 0.1
+    assert shape_rmse(posterior.candidates.corners_map, true) < 0.02
 
 
 def test_a_marking_that_is_not_long_has_no_end_to_lose():
@@ -266,23 +268,25 @@ def test_two_opposite_corners_in_a_shadow_do_not_make_another_shape():
     shift = 0.1 * (true[12, 1] - true[12, 0])
     candidates.corners_map[12, 0] += shift
     candidates.corners_map[12, 2] -= shift
-    found = of_one_class(candidates)
-    assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
+    posterior = of_one_class(candidates)
+    assert (
+        np.linalg.norm(posterior.candidates.corners_map - true, axis=2) < 3 * posterior.candidates.sigma_m
+    ).all()
 
 
 def test_two_neighbouring_corners_of_a_rhombus_leave_two_places_for_it():
     _, candidates = row(6, [DIAMOND] * 30)
-    found = of_one_class(without(candidates, 4, [0, 1]))
-    assert found.candidates.sigma_m[4].max() > 0.15
-    assert found.candidates.sigma_m[[3, 5]].max() < 0.1
+    posterior = of_one_class(without(candidates, 4, [0, 1]))
+    assert posterior.candidates.sigma_m[4].max() > 0.15
+    assert posterior.candidates.sigma_m[[3, 5]].max() < 0.1
 
 
 def test_one_end_says_nothing_of_the_other_where_lengths_differ():
     rng = np.random.default_rng(7)
     true = painted([DASH * [(1.0, 0.8)[k % 2], 1.0] for k in range(40)], rng)
     ends = np.argsort(np.linalg.norm(true[4] - true[4, 0], axis=1))[2:].tolist()
-    found = of_one_class(without(solved(true, rng, 0.005), 4, ends))
-    assert found.candidates.sigma_m[4].max() > 0.15
+    posterior = of_one_class(without(solved(true, rng, 0.005), 4, ends))
+    assert posterior.candidates.sigma_m[4].max() > 0.15
 
 
 def test_a_class_may_have_several_shapes():
@@ -296,12 +300,12 @@ def test_a_class_may_have_several_shapes():
 def test_a_class_of_many_shapes_is_left_as_it_was_seen_but_for_being_parallelograms():
     sizes = np.random.default_rng(8).uniform(0.5, 2.0, 12)
     true, candidates = row(9, [DIAMOND * size for size in sizes], 0.02)
-    found = of_one_class(candidates)
-    corners = found.candidates.corners_map
+    posterior = of_one_class(candidates)
+    corners = posterior.candidates.corners_map
     closure = corners[:, 0] - corners[:, 1] + corners[:, 2] - corners[:, 3]
     assert np.linalg.norm(closure, axis=1).max() < 0.05
     assert shape_rmse(corners, true) < shape_rmse(candidates.corners_map, true)
-    assert (found.log_odds > 3).all()
+    assert (posterior.log_odds > 3).all()
 
 
 def test_a_worn_marking_of_known_shape_is_one_although_few_images_show_it():
@@ -320,9 +324,9 @@ def odd_and_seldom():
 
 
 def test_what_has_no_shape_and_is_seldom_found_is_clutter():
-    found = of_one_class(*odd_and_seldom())
-    assert found.probability[7, Kind.CLUTTER] > 0.8
-    assert (np.delete(found.log_odds, 7) > 5).all()
+    posterior = of_one_class(*odd_and_seldom())
+    assert posterior.probability[7, Kind.CLUTTER] > 0.8
+    assert (np.delete(posterior.log_odds, 7) > 5).all()
 
 
 def test_what_many_images_show_as_an_arrow_is_part_of_one():
@@ -359,7 +363,7 @@ def test_reasons_name_what_has_won():
     assert reasons[5] == "a corner was never seen twice"
     assert reasons[7] in ("found in too few of its images", "not shaped like a marking of its class")
     assert len(classified.markings()) == 37
-    assert [one.reason for one in classified.exclusions()] == list(reasons.values())
+    assert [exclusion.reason for exclusion in classified.exclusions()] == list(reasons.values())
 
 
 def test_of_two_markings_on_one_spot_the_likelier_stays():
@@ -402,13 +406,13 @@ def test_an_end_at_which_something_stands_may_lie_behind_it():
     cut_ends = [(dash, cut_short(candidates, true, dash, cut)) for dash, cut in enumerate(CUTS_M)]
     for dash, end in cut_ends:
         odds[dash, end[0]] = 3.0
-    told = verdict(candidates, standing=lambda corners_map, is_end: is_end * odds)
-    assert not any(told.verdict)
+    posterior = verdict(candidates, standing=lambda corners_map, is_end: is_end * odds)
+    assert not any(posterior.verdict)
     for dash, end in cut_ends:
-        off_m = np.linalg.norm(told.candidates.corners_map[dash, end] - true[dash, end], axis=1)
+        off_m = np.linalg.norm(posterior.candidates.corners_map[dash, end] - true[dash, end], axis=1)
         assert (off_m < 0.4).all()
-        assert (off_m < 3 * told.candidates.sigma_m[dash, end]).all()
-    assert (told.candidates.sigma_m[len(CUTS_M) :] < 0.1).all()
+        assert (off_m < 3 * posterior.candidates.sigma_m[dash, end]).all()
+    assert (posterior.candidates.sigma_m[len(CUTS_M) :] < 0.1).all()
 
 
 CUTS_M = np.linspace(0.45, 1.2, 8)
@@ -433,17 +437,17 @@ def test_a_diamond_that_shows_only_a_piece_between_two_sides_is_not_a_small_diam
     true = painted([DIAMOND] * 40, rng)
     candidates = solved(true, rng)
     candidates.corners_map[7] = piece_of(true[7])
-    found = of_one_class(candidates)
-    assert found.probability[7, Kind.PIECE] > 0.8
-    assert normalised(found, true)[7] < 20
+    posterior = of_one_class(candidates)
+    assert posterior.probability[7, Kind.PIECE] > 0.8
+    assert normalised(posterior, true)[7] < 20
 
 
 def test_diamonds_of_a_second_stencil_are_no_pieces_of_the_first():
     rng = np.random.default_rng(17)
     true = painted([DIAMOND] * 40 + [0.7 * DIAMOND] * 12, rng)
-    found = of_one_class(solved(true, rng))
-    assert (found.probability[:, Kind.OF_CLASS] > 0.9).all()
-    assert shape_rmse(found.candidates.corners_map, true) < 0.02
+    posterior = of_one_class(solved(true, rng))
+    assert (posterior.probability[:, Kind.OF_CLASS] > 0.9).all()
+    assert shape_rmse(posterior.candidates.corners_map, true) < 0.02
 
 
 def test_the_odd_one_of_a_class_of_few_members_is_not_sure_of_its_size():
@@ -451,9 +455,9 @@ def test_the_odd_one_of_a_class_of_few_members_is_not_sure_of_its_size():
     true = painted([DIAMOND] * 5, rng)
     candidates = solved(true, rng)
     candidates.corners_map[2] = piece_of(true[2])
-    found = of_one_class(candidates)
-    assert (normalised(found, true) < 25).all()
-    assert (found.probability[[0, 1, 3, 4], Kind.OF_CLASS] > 0.8).all()
+    posterior = of_one_class(candidates)
+    assert (normalised(posterior, true) < 25).all()
+    assert (posterior.probability[[0, 1, 3, 4], Kind.OF_CLASS] > 0.8).all()
 
 
 def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict():
@@ -463,7 +467,7 @@ def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict():
     many = FusedGroups(candidates.corners_map, np.tile(1e-4 * np.eye(2), (3, 4, 1, 1)), np.full((3, 4), 9))
     longer = 0.1 * (true[1, 0] - true[1].mean(axis=0)) / np.linalg.norm(true[1, 0] - true[1].mean(axis=0))
     # One sighting of a tenth of the information sees the end 10 cm farther, one a metre beyond its reach.
-    found = with_dissent(
+    widened = with_dissent(
         candidates,
         many,
         row=np.array([5, 6]),
@@ -472,7 +476,7 @@ def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict():
         seen_map=np.stack([candidates.corners_map[1, 0] + longer, candidates.corners_map[2, 0] + [2.0, 0]]),
         covariance_m2=np.tile(9e-4 * np.eye(2), (2, 1, 1)),
     )
-    added = found.covariance_m2 - candidates.covariance_m2
+    added = widened.covariance_m2 - candidates.covariance_m2
     assert np.trace(added[1]) == pytest.approx(0.1 * 0.1**2, rel=0.1)
     np.testing.assert_allclose(added[1][2:, 2:], 0)
     np.testing.assert_allclose(added[[0, 2]], 0)
@@ -497,15 +501,15 @@ def test_a_dash_cut_at_the_usual_length_is_uncertain_where_images_disagree_on_it
         odds[dash, end[0]] = 3.0
     fused = FusedGroups(candidates.corners_map, one_image / 8, np.full((len(true), 4), 8))
     shared = with_shared_errors(candidates, fused, scatter_of(squared, degrees))
-    found = verdict(shared, counts, lambda corners_map, is_end: is_end * odds)
-    assert found.candidates.sigma_m[0].max() > 3 * found.candidates.sigma_m[0].min()
-    assert not any(found.verdict[15:77])
+    posterior = verdict(shared, counts, lambda corners_map, is_end: is_end * odds)
+    assert posterior.candidates.sigma_m[0].max() > 3 * posterior.candidates.sigma_m[0].min()
+    assert not any(posterior.verdict[15:77])
 
 
 def test_a_candidate_that_lost_all_corners_lies_where_it_was_seen():
     unseen = np.full((1, 4, 2), np.nan)
-    found = Candidates.seen(unseen, np.full((1, 8, 8), np.nan), np.array([[30.0, 4.0]]))
-    np.testing.assert_array_equal(found.corners_map, np.broadcast_to([30.0, 4.0], (1, 4, 2)))
+    candidates = Candidates.seen(unseen, np.full((1, 8, 8), np.nan), np.array([[30.0, 4.0]]))
+    np.testing.assert_array_equal(candidates.corners_map, np.broadcast_to([30.0, 4.0], (1, 4, 2)))
 
 
 def test_what_looks_unlike_its_class_and_has_another_shape_is_a_letter_and_a_worn_marking_is_none():
@@ -546,9 +550,9 @@ def bend(radius_m=15.0, apart_m=6.0):
 
 def test_dashes_of_a_bend_are_as_much_longer_as_they_stand_farther_apart():
     true = bend()
-    found = of_one_class(solved(true, np.random.default_rng(23), 0.005))
-    assert found.probability[:, Kind.WRONG_END].max() < 0.02
-    assert np.sqrt(np.diagonal(found.candidates.covariance_m2, axis1=1, axis2=2)).max() < 0.05
+    posterior = of_one_class(solved(true, np.random.default_rng(23), 0.005))
+    assert posterior.probability[:, Kind.WRONG_END].max() < 0.02
+    assert np.sqrt(np.diagonal(posterior.candidates.covariance_m2, axis1=1, axis2=2)).max() < 0.05
 
 
 @pytest.mark.parametrize("uneven_m", [0.0, 1.0])
@@ -558,7 +562,7 @@ def test_which_end_runs_on_follows_from_the_neighbours_of_a_line_that_is_evenly_
     true = DASH + np.stack([along, 0 * along], axis=1)[:, None]
     candidates = solved(true, rng, 0.005)
     moved_end(candidates, 12, 0.4)
-    found = of_one_class(candidates)
-    error = np.linalg.norm(found.candidates.corners_map - true, axis=2)
-    assert (error < 3 * found.candidates.sigma_m).all()
-    assert (found.candidates.sigma_m[12].max() < 0.1) == (uneven_m == 0)
+    posterior = of_one_class(candidates)
+    error = np.linalg.norm(posterior.candidates.corners_map - true, axis=2)
+    assert (error < 3 * posterior.candidates.sigma_m).all()
+    assert (posterior.candidates.sigma_m[12].max() < 0.1) == (uneven_m == 0)

@@ -13,7 +13,7 @@ from v2hdm.records import Calibration, HDMap, PaintLeft
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import PaintConfig, RouteConfig
 from v2hdm.simulate.render import ground
-from v2hdm.site.living.wear import with_wear
+from v2hdm.site.living.wear import Footage, with_wear
 
 FOOTPRINT_M = 0.012  # of a pixel of the nearest images, at which the renderer draws the flakes
 
@@ -43,24 +43,31 @@ def measured(folder, port, earlier=None):
     """(map, rendered shares by marking) under the true geometry: markings that half the images show whole."""
     drive = read_drive(folder)
     truth = read_truth(drive)
-    calibrations = {k: Calibration(one.info, truth.cam_from_vehicle[k]) for k, one in drive.cameras.items()}
+    calibrations = {
+        k: Calibration(camera.info, truth.cam_from_vehicle[k]) for k, camera in drive.cameras.items()
+    }
     visible = truth.visibility > 0.95
-    known = np.flatnonzero(visible.sum(axis=0) >= 2)
-    markings = [replace(truth.map.markings[k], id=int(k) + 1) for k in known]
-    shown = {(int(image), int(number)) for image, number in np.argwhere(visible[:, known])}
+    rows = np.flatnonzero(visible.sum(axis=0) >= 2)
+    markings = [replace(truth.map.markings[k], id=int(k) + 1) for k in rows]
+    shown = {(int(image), int(number)) for image, number in np.argwhere(visible[:, rows])}
     paints = build_port(port).renderer.scene.paints
-    centres = np.array([one.polygon_map.mean(axis=0) for one in paints])
+    centres = np.array([paint.polygon_map.mean(axis=0) for paint in paints])
     nearest = [np.argmin(((centres - m.corners_map.mean(axis=0)) ** 2).sum(axis=1)) for m in markings]
     poses, grey = truth.map_from_vehicle, grey_reader(drive)
-    hd_map = with_wear(HDMap(tuple(markings)), drive.images, poses, calibrations, grey, shown, earlier)
+    footage = Footage(drive.images, poses, calibrations, None)
+    hd_map = with_wear(HDMap(tuple(markings)), footage, grey, shown, earlier)
     return hd_map, {m.id: share_rendered(paints[k]) for m, k in zip(markings, nearest, strict=True)}
 
 
 def test_the_share_of_paint_left_is_within_five_hundredths_of_what_was_rendered(short_drive):
     hd_map, true_share = measured(short_drive, short_port())
-    found = [(one.paint.share, one.paint.sigma, true_share[one.id]) for one in hd_map.markings if one.paint]
-    share, sigma, true = np.array(found).T
-    assert len(found) > 20
+    measured_shares = [
+        (marking.paint.share, marking.paint.sigma, true_share[marking.id])
+        for marking in hd_map.markings
+        if marking.paint
+    ]
+    share, sigma, true = np.array(measured_shares).T
+    assert len(measured_shares) > 20
     assert true.min() < 0.4  # some are nearly gone
     assert np.abs(share - true).mean() <= 0.05
     assert np.mean(np.abs(share - true) <= 2 * sigma) >= 0.85
@@ -71,9 +78,13 @@ def test_shadows_and_vehicles_of_a_port_that_nothing_was_tuned_on_are_no_wear(re
     route = RouteConfig(pieces=TINY_ROUTE, image_spacing_m=2.0)
     port = replace(short_port(), seed=10, route=route)
     hd_map, true_share = measured(rendered(port), port)
-    found = [(one.paint.share, one.paint.sigma, true_share[one.id]) for one in hd_map.markings if one.paint]
-    share, sigma, true = np.array(found).T
-    assert len(found) > 10
+    measured_shares = [
+        (marking.paint.share, marking.paint.sigma, true_share[marking.id])
+        for marking in hd_map.markings
+        if marking.paint
+    ]
+    share, sigma, true = np.array(measured_shares).T
+    assert len(measured_shares) > 10
     assert np.abs(share - true).mean() <= 0.06
     assert np.mean(np.abs(share - true) <= 2 * sigma) >= 0.95
 
@@ -82,13 +93,13 @@ def test_two_sessions_keep_the_order_and_the_second_states_the_change(rendered):
     worn = small_port(paint=replace(PaintConfig(), wear=0.3))
     first, before = measured(rendered(small_port()), small_port())
     second, after = measured(rendered(worn), worn, first)
-    compared = [one for one in second.markings if one.paint and one.paint.change is not None]
-    true = np.array([after[one.id] - before[one.id] for one in compared])
-    change = np.array([one.paint.change for one in compared])
+    compared = [marking for marking in second.markings if marking.paint and marking.paint.change is not None]
+    true = np.array([after[marking.id] - before[marking.id] for marking in compared])
+    change = np.array([marking.paint.change for marking in compared])
     clearly = true < -0.1
     assert clearly.sum() >= 5
     assert (change[clearly] < 0).all()
-    sigma = np.array([one.paint.change_sigma for one in compared])
+    sigma = np.array([marking.paint.change_sigma for marking in compared])
     assert np.mean(np.abs(change - true) <= 2 * sigma) >= 0.85
 
 
@@ -96,6 +107,8 @@ def test_a_marking_that_no_image_shows_keeps_what_the_earlier_map_says(small_dri
     drive = read_drive(small_drive)
     away = replace(read_truth(drive).map.markings[0], corners_map=np.eye(4)[:, :2] + 1e4, id=1)
     before = HDMap((replace(away, paint=PaintLeft(0.7, 0.1)),))
-    arguments = drive.images, [one.map_from_vehicle for one in drive.images], {}, grey_reader(drive), set()
-    assert with_wear(HDMap((away,)), *arguments, before).markings[0].paint == PaintLeft(0.7, 0.1)
-    assert with_wear(HDMap((away,)), *arguments).markings[0].paint is None
+    footage = Footage(drive.images, [image.map_from_vehicle for image in drive.images], {}, None)
+    grey = grey_reader(drive)
+    updated = with_wear(HDMap((away,)), footage, grey, set(), before)
+    assert updated.markings[0].paint == PaintLeft(0.7, 0.1)
+    assert with_wear(HDMap((away,)), footage, grey, set()).markings[0].paint is None

@@ -110,9 +110,9 @@ def street(origin: GeodeticOrigin | None = ORIGIN, with_heights: bool = True) ->
 def assert_same_map(got: HDMap, expected: HDMap) -> None:
     """Every value to the last bit, but ids, which a file gives."""
     assert got.origin == expected.origin
-    for one, other in zip(_features(got), _features(expected), strict=True):
-        for name, value in vars(replace(other, id=one.id)).items():
-            np.testing.assert_array_equal(getattr(one, name), value, err_msg=name)
+    for feature, other in zip(_features(got), _features(expected), strict=True):
+        for name, value in vars(replace(other, id=feature.id)).items():
+            np.testing.assert_array_equal(getattr(feature, name), value, err_msg=name)
 
 
 def _features(hd_map: HDMap) -> list[Marking | Lane | Symbol]:

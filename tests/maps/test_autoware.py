@@ -47,14 +47,14 @@ def versions_missing(root):
 
 
 def nodes_without_local_coordinates(root):
-    wanted = {"local_x", "local_y", "ele"}
-    return [node for node in root.findall("node") if not wanted <= set(tags_of(node))]
+    needed = {"local_x", "local_y", "ele"}
+    return [node for node in root.findall("node") if not needed <= set(tags_of(node))]
 
 
 def roads_of_other_places_or_both_ways(root):
     """vm-01-01."""
-    wanted = {"location": "urban", "one_way": "yes"}
-    return [lanelet for lanelet in lanelets_of(root) if not wanted.items() <= tags_of(lanelet).items()]
+    needed = {"location": "urban", "one_way": "yes"}
+    return [lanelet for lanelet in lanelets_of(root) if not needed.items() <= tags_of(lanelet).items()]
 
 
 def roads_closed_to_all(root):

@@ -56,7 +56,7 @@ def test_a_datum_that_moves_the_cursor_is_refused_by_its_place(tmp_path):
     write_geojson(replace(make_map(), origin=GeodeticOrigin(48.1, 11.6, 500.0)), tmp_path / "map.geojson")
     text = (tmp_path / "map.geojson").read_text().replace('"WGS84"', '"\\u001b[2J"', 1)
     (tmp_path / "map.geojson").write_text(text)
-    with pytest.raises(MapFileError, match=r"origin, datum: '.\[2J' is no name of a datum"):
+    with pytest.raises(MapFileError, match=r"origin, datum: '.\[2J' is not the name of a datum"):
         read_geojson(tmp_path / "map.geojson")
 
 

@@ -35,7 +35,11 @@ def test_qgis_has_the_classes_in_these_colours_and_dashed_lines_dashed(tmp_path)
     for layer in root.findall("projectlayers/maplayer"):
         renderer = layer.find("renderer-v2")
         for category in [] if renderer is None else renderer.findall("categories/category"):
-            (symbol,) = [one for one in renderer.iter("symbol") if one.get("name") == category.get("symbol")]
+            (symbol,) = [
+                candidate
+                for candidate in renderer.iter("symbol")
+                if candidate.get("name") == category.get("symbol")
+            ]
             options = {option.get("name"): option.get("value") for option in symbol.iter("Option")}
             styles[layer.findtext("layername"), category.get("value")] = options
     for kind, colour in expected.items():

@@ -69,7 +69,9 @@ def test_lanelet2_has_a_crosswalk_between_zebra_markings_and_reads_it(folder):
         lanelet2.io.Origin(ORIGIN.latitude_deg, ORIGIN.longitude_deg, ORIGIN.altitude_m)
     )
     loaded = lanelet2.io.load(str(folder / "map_lanelet2" / "lanelet2_map.osm"), projector)
-    (crosswalk,) = [one for one in loaded.laneletLayer if one.attributes["subtype"] == "crosswalk"]
+    (crosswalk,) = [
+        lanelet for lanelet in loaded.laneletLayer if lanelet.attributes["subtype"] == "crosswalk"
+    ]
     for bound in (crosswalk.leftBound, crosswalk.rightBound):
         assert bound.attributes["type"] == "zebra_marking"
         assert len(bound) == 2
@@ -88,9 +90,9 @@ def test_lanelet2_has_a_crosswalk_between_zebra_markings_and_reads_it(folder):
     subtypes = {p.attributes["subtype"] for p in loaded.polygonLayer if p.attributes["type"] == "road_symbol"}
     assert subtypes == {"text", "box", "bicycle", "taxi_rank"}
     (double,) = [
-        one
-        for one in loaded.lineStringLayer
-        if "class" in one.attributes and one.attributes["class"] == "double_line"
+        line
+        for line in loaded.lineStringLayer
+        if "class" in line.attributes and line.attributes["class"] == "double_line"
     ]
     # The line runs east, the dashed one of the two on its left.
     assert double.attributes["subtype"] == "dashed_solid"
@@ -121,7 +123,9 @@ def test_a_double_line_has_lanelet2_s_subtype_and_opendrive_s_mark(lines, subtyp
 
 
 def test_opendrive_has_a_crosswalk_and_all_else_as_road_marks_by_name(hd_map, folder):
-    objects = {one.get("id"): one for one in ET.parse(folder / "map.xodr").getroot().iter("object")}
+    objects = {
+        element.get("id"): element for element in ET.parse(folder / "map.xodr").getroot().iter("object")
+    }
     for feature in features_of(hd_map):
         if feature.closed:
             element = objects[str(feature.id)]
@@ -145,8 +149,8 @@ def test_csv_and_dxf_tell_what_is_composed_of_what(hd_map, folder):
     kinds = {feature.kind for feature in features_of(hd_map)}
     assert kinds <= {layer.dxf.name for layer in drawing.layers}
     (double,) = drawing.modelspace().query('POLYLINE[layer=="double_line"]')
-    told = [value for _, value in double.get_xdata("V2HDM")]
-    assert told[told.index("lines") + 1] == "lane_dash lane_line"
+    values = [value for _, value in double.get_xdata("V2HDM")]
+    assert values[values.index("lines") + 1] == "lane_dash lane_line"
 
 
 @pytest.mark.parametrize(

@@ -127,8 +127,8 @@ def test_a_corner_that_was_moved_is_known_as_a_hand_places_it(tmp_path):
     assert off_m[moved] == pytest.approx(0.14, abs=0.005)
     assert np.sqrt(np.diagonal(after.covariance_m2)[2 * moved : 2 * moved + 2]).min() >= 0.02
     others = np.delete(np.arange(8), [2 * moved, 2 * moved + 1])
-    kept = np.ix_(others, others)
-    np.testing.assert_allclose(after.covariance_m2[kept], before.covariance_m2[kept])
+    of_others = np.ix_(others, others)
+    np.testing.assert_allclose(after.covariance_m2[of_others], before.covariance_m2[of_others])
     assert after.accuracy is None
     assert np.linalg.eigvalsh(after.covariance_m2).min() > 0
 
@@ -176,11 +176,11 @@ def test_ids_are_unique_and_stay_when_features_go_or_are_copied(tmp_path, caplog
     path.write_text(json.dumps(content))
     with caplog.at_level(logging.INFO, "v2hdm"):
         hd_map = read_geojson(path)
-    assert [one.id for one in (*hd_map.markings, *hd_map.lanes)] == [2, 3, 4, 5, 9, 6, 7, 8]
+    assert [feature.id for feature in (*hd_map.markings, *hd_map.lanes)] == [2, 3, 4, 5, 9, 6, 7, 8]
     assert "1 features had no id of their own" in caplog.text
     write_geojson(hd_map, path)
     again = read_geojson(path)
-    assert [one.id for one in (*again.markings, *again.lanes)] == [2, 3, 4, 5, 9, 6, 7, 8]
+    assert [feature.id for feature in (*again.markings, *again.lanes)] == [2, 3, 4, 5, 9, 6, 7, 8]
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ DRIFT_M, OWN_M = 0.1, 0.01
 def dashes(count=12):
     """Corners (4 count, 2) of dashes 12 cm wide, every 6 m along x and along y by turns."""
     turned = [DASH if k % 2 else DASH[:, ::-1] for k in range(count)]
-    return np.concatenate([one + np.array([6.0 * k, 0.0]) for k, one in enumerate(turned)])
+    return np.concatenate([dash + np.array([6.0 * k, 0.0]) for k, dash in enumerate(turned)])
 
 
 def covariance(count, drift_m=DRIFT_M):
@@ -254,8 +254,8 @@ def test_a_shift_by_more_than_half_a_dash_is_seen_through_and_the_nearest_corner
         shift = rng.uniform(0.07, 0.1) * np.array([np.cos(angle := rng.uniform(0, 6.3)), np.sin(angle)])
         points = corners[chosen] - shift + OWN_M * rng.standard_normal((8, 2))
         right.append((match(points, corners, 0.25, covariance(8)) == chosen).all())
-        apart = np.linalg.norm(points[:, None] - corners, axis=-1)
-        nearest.append((apart.argmin(axis=1) == chosen).all())
+        distances_m = np.linalg.norm(points[:, None] - corners, axis=-1)
+        nearest.append((distances_m.argmin(axis=1) == chosen).all())
     assert np.mean(right) > 0.9
     assert np.mean(nearest) < 0.3
 
@@ -266,9 +266,9 @@ def test_a_point_that_is_off_is_matched_all_the_same_and_moves_no_other(drift_m)
     chosen = np.array([0, 5, 10, 15, 20])
     points = corners[chosen].copy()
     points[3] += 0.2, 0.0
-    found = match(points, corners, 0.25, covariance(5, drift_m))
-    np.testing.assert_array_equal(found[[0, 1, 2, 4]], chosen[[0, 1, 2, 4]])
-    assert found[3] >= 0
+    matched = match(points, corners, 0.25, covariance(5, drift_m))
+    np.testing.assert_array_equal(matched[[0, 1, 2, 4]], chosen[[0, 1, 2, 4]])
+    assert matched[3] >= 0
 
 
 def test_no_corner_has_two_points_and_none_is_out_of_reach():

@@ -79,27 +79,27 @@ def of_dxf(path):
 
 
 def of_gdal(*paths):
-    found = Counter()
+    class_counts = Counter()
     for path in paths:
         for layer, _ in pyogrio.list_layers(path):
             meta, _, _, columns = pyogrio.raw.read(path, layer=layer)
             table = dict(zip(meta["fields"], columns, strict=True))
-            found += Counter(dict(zip(table["id"].tolist(), table["class"], strict=True)).values())
-    return found
+            class_counts += Counter(dict(zip(table["id"].tolist(), table["class"], strict=True)).values())
+    return class_counts
 
 
 def of_opendrive(path):
     objects = ET.parse(path).findall(".//objects/object")
     stated = [
-        next((data.get("value") for data in each.iterfind("userData[@code='class']")), each.get("name"))
-        for each in objects
+        next((data.get("value") for data in element.iterfind("userData[@code='class']")), element.get("name"))
+        for element in objects
     ]
     return Counter(stated)
 
 
 def of_landxml(path):
     space = {"x": "http://www.landxml.org/schema/LandXML-1.2"}
-    return Counter(each.get("desc") for each in ET.parse(path).iterfind(".//x:PlanFeature", space))
+    return Counter(feature.get("desc") for feature in ET.parse(path).iterfind(".//x:PlanFeature", space))
 
 
 def of_kml(path):

@@ -89,10 +89,10 @@ def test_a_project_opens_the_geopackage_that_is_there_and_replaces_no_other(fold
 
 
 def test_a_geopackage_of_an_earlier_export_is_made_anew_for_a_project(folder):
-    for there in (replace(street(), lanes=()), street()):
-        write_geojson(there, folder / "map.geojson")
+    for hd_map in (replace(street(), lanes=()), street()):
+        write_geojson(hd_map, folder / "map.geojson")
         assert run(["export", "map.geojson", "--format", "qgis", "--output", "there"]) == 0
-        assert len(read_map(folder / "there" / "map.gpkg")[0].lanes) == len(there.lanes)
+        assert len(read_map(folder / "there" / "map.gpkg")[0].lanes) == len(hd_map.lanes)
 
 
 @pytest.mark.parametrize(
@@ -131,11 +131,11 @@ def written(folder, form, calibration=CALIBRATION):
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form_tells_sigmas_drive_date_and_verdict(tmp_path, form):
     lines = written(tmp_path, form).read_text(encoding="utf-8").splitlines()
-    told = yaml.safe_load("\n".join(line[2:] for line in lines if line.startswith("# ")))
-    assert told["camera_name"] == "front"
-    assert (told["drive"], str(told["date"]), told["verdict"]) == ("yard: 7", "2026-05-04", "WARN")
-    np.testing.assert_allclose(told["translation_sigma_m"], SIGMAS[:3])
-    np.testing.assert_allclose(told["rotation_sigma_deg"], np.degrees(SIGMAS[3:]))
+    header = yaml.safe_load("\n".join(line[2:] for line in lines if line.startswith("# ")))
+    assert header["camera_name"] == "front"
+    assert (header["drive"], str(header["date"]), header["verdict"]) == ("yard: 7", "2026-05-04", "WARN")
+    np.testing.assert_allclose(header["translation_sigma_m"], SIGMAS[:3])
+    np.testing.assert_allclose(header["rotation_sigma_deg"], np.degrees(SIGMAS[3:]))
 
 
 def test_camera_info_has_the_matrices_of_ros(tmp_path):
@@ -146,10 +146,13 @@ def test_camera_info_has_the_matrices_of_ros(tmp_path):
 
 
 def test_a_static_transform_is_where_the_camera_sits_on_the_vehicle(tmp_path):
-    (one,) = yaml.safe_load(written(tmp_path, "static_transform").read_text())["transforms"]
-    assert (one["header"]["frame_id"], one["child_frame_id"]) == ("base_link", "front_optical_frame")
-    rotation = Rotation.from_quat([one["transform"]["rotation"][axis] for axis in "xyzw"]).as_matrix()
-    translation = [one["transform"]["translation"][axis] for axis in "xyz"]
+    (transform,) = yaml.safe_load(written(tmp_path, "static_transform").read_text())["transforms"]
+    assert (transform["header"]["frame_id"], transform["child_frame_id"]) == (
+        "base_link",
+        "front_optical_frame",
+    )
+    rotation = Rotation.from_quat([transform["transform"]["rotation"][axis] for axis in "xyzw"]).as_matrix()
+    translation = [transform["transform"]["translation"][axis] for axis in "xyz"]
     assert_inverse(rotation, translation, CALIBRATION.cam_from_vehicle)
 
 
@@ -293,4 +296,4 @@ def test_questions_that_were_answered_in_their_file_are_followed(tmp_path, monke
     text = (tmp_path / "answers.geojson").read_text().replace('"connection"', '"colour"')
     (tmp_path / "answers.geojson").write_text(text)
     assert run([*again, "--answers", "answers.geojson", "--output", "there"]) == 2
-    assert "'colour' is no subject of a question" in capsys.readouterr().err
+    assert "'colour' is not a subject of a question" in capsys.readouterr().err

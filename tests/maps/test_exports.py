@@ -82,10 +82,15 @@ def test_geojson_is_read_by_gdal(tmp_path, origin):
     assert fids.tolist() == list(range(1, 9))
     table = dict(zip(meta["fields"], columns, strict=True))
     assert table["id"].tolist() == fids.tolist()
-    for number, one, kind, wkb in zip(fids, features(hd_map).values(), table["class"], geometry, strict=True):
-        assert kind == one.kind
+    for number, feature, kind, wkb in zip(
+        fids, features(hd_map).values(), table["class"], geometry, strict=True
+    ):
+        assert kind == feature.kind
         np.testing.assert_allclose(
-            to_map(from_wkb(wkb), origin), xyz(one)[ring(one)], atol=TENTH_OF_A_MM, err_msg=str(number)
+            to_map(from_wkb(wkb), origin),
+            xyz(feature)[ring(feature)],
+            atol=TENTH_OF_A_MM,
+            err_msg=str(number),
         )
 
 
@@ -109,26 +114,30 @@ def test_csv_has_every_point_with_its_covariance(tmp_path, origin, with_heights)
         rows = list(csv.DictReader(file))
     grouped = {int(k): list(group) for k, group in itertools.groupby(rows, key=lambda row: row["id"])}
     assert list(grouped) == list(range(1, 9))
-    for number, one in features(hd_map).items():
+    for number, feature in features(hd_map).items():
         mine = grouped[number]
         assert [row["point"] for row in mine] == [str(k + 1) for k in range(len(mine))]
-        assert {row["class"] for row in mine} == {one.kind}
-        assert {row["sightings"] for row in mine} == {str(one.sightings)}
-        assert {row["accuracy"] for row in mine} == {getattr(one, "accuracy", "")}
+        assert {row["class"] for row in mine} == {feature.kind}
+        assert {row["sightings"] for row in mine} == {str(feature.sightings)}
+        assert {row["accuracy"] for row in mine} == {getattr(feature, "accuracy", "")}
         got = np.array([[float(row["x_map_m"]), float(row["y_map_m"])] for row in mine])
-        np.testing.assert_array_equal(got, xyz(one)[:, :2])
+        np.testing.assert_array_equal(got, xyz(feature)[:, :2])
         heights = [row["height_m"] for row in mine]
-        assert heights == ([repr(h) for h in xyz(one)[:, 2].tolist()] if with_heights else [""] * len(mine))
+        assert heights == (
+            [repr(h) for h in xyz(feature)[:, 2].tolist()] if with_heights else [""] * len(mine)
+        )
         if origin is not None:
             keys = ("longitude_deg", "latitude_deg", "ellipsoidal_height_m")
             degrees = np.array([[float(row[key]) for key in keys] for row in mine])
-            np.testing.assert_allclose(to_map(degrees, origin), xyz(one), atol=TENTH_OF_A_MM)
-        if isinstance(one, Marking) and one.covariance_m2 is not None:
+            np.testing.assert_allclose(to_map(degrees, origin), xyz(feature), atol=TENTH_OF_A_MM)
+        if isinstance(feature, Marking) and feature.covariance_m2 is not None:
             columns = [f"cov_{{}}_{other}{k}_m2" for k in range(1, 5) for other in "xy"]
-            matrix = [[float(row[column.format(own)]) for column in columns] for row in mine for own in "xy"]
-            np.testing.assert_array_equal(matrix, one.covariance_m2)
+            matrix = [
+                [float(row[column.format(axis)]) for column in columns] for row in mine for axis in "xy"
+            ]
+            np.testing.assert_array_equal(matrix, feature.covariance_m2)
             sigmas = [[float(row["sigma_x_m"]), float(row["sigma_y_m"])] for row in mine]
-            np.testing.assert_allclose(np.ravel(sigmas), np.sqrt(np.diag(one.covariance_m2)))
+            np.testing.assert_allclose(np.ravel(sigmas), np.sqrt(np.diag(feature.covariance_m2)))
 
 
 @BOTH
@@ -140,13 +149,13 @@ def test_a_geopackage_is_read_by_sqlite_alone(tmp_path, origin):
     assert [row[0] for row in rows] == list(range(1, 9))
     envelope_bytes = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}
     for number, kind, blob, covariance, accuracy in rows:
-        one = features(hd_map)[number]
-        assert (kind, accuracy) == (one.kind, getattr(one, "accuracy", None))
+        feature = features(hd_map)[number]
+        assert (kind, accuracy) == (feature.kind, getattr(feature, "accuracy", None))
         header = 8 + envelope_bytes[blob[3] >> 1 & 7]
         got = to_map(from_wkb(blob[header:]), origin)
-        np.testing.assert_allclose(got, xyz(one)[ring(one)], atol=TENTH_OF_A_MM)
-        if isinstance(one, Marking):
-            np.testing.assert_array_equal(yaml.safe_load(covariance), one.covariance_m2)
+        np.testing.assert_allclose(got, xyz(feature)[ring(feature)], atol=TENTH_OF_A_MM)
+        if isinstance(feature, Marking):
+            np.testing.assert_array_equal(yaml.safe_load(covariance), feature.covariance_m2)
     definition, organisation = data.execute(
         "SELECT definition, organization FROM gpkg_spatial_ref_sys JOIN gpkg_contents USING (srs_id) "
         "WHERE table_name = 'markings'"
@@ -175,9 +184,9 @@ def test_a_geopackage_brings_a_style_of_every_class_as_qgis_looks_for_it(tmp_pat
         assert (column, default) == ("geom", 1)
         root = ET.fromstring(style)
         categories = root.findall("renderer-v2/categories/category")
-        assert {one.get("value") for one in categories} == classes[layer] | {""}
-        symbols = {one.get("name") for one in root.findall("renderer-v2/symbols/symbol")}
-        assert {one.get("symbol") for one in categories} == symbols
+        assert {category.get("value") for category in categories} == classes[layer] | {""}
+        symbols = {symbol.get("name") for symbol in root.findall("renderer-v2/symbols/symbol")}
+        assert {category.get("symbol") for category in categories} == symbols
 
 
 def test_a_dxf_is_read_by_gdal_and_holds_what_cad_does_not_know(tmp_path):
@@ -187,20 +196,20 @@ def test_a_dxf_is_read_by_gdal_and_holds_what_cad_does_not_know(tmp_path):
     layers = dict(zip(meta["fields"], columns, strict=True))["Layer"]
     lines = list(ezdxf.readfile(path).modelspace())
     assert len(lines) == len(geometry) == 8
-    for one, layer, wkb, line in zip(features(hd_map).values(), layers, geometry, lines, strict=True):
-        assert layer == one.kind
-        closed = isinstance(one, Marking)
+    for feature, layer, wkb, line in zip(features(hd_map).values(), layers, geometry, lines, strict=True):
+        assert layer == feature.kind
+        closed = isinstance(feature, Marking)
         assert line.is_closed is closed
         got = from_wkb(wkb)
-        count = len(xyz(one))
-        np.testing.assert_allclose(got[:count], xyz(one)[ring(one)], atol=TENTH_OF_A_MM)
-        told = [value for _, value in line.get_xdata("V2HDM")]
-        assert features(hd_map)[told[told.index("id") + 1]] is one
-        assert told[told.index("sightings") + 1] == one.sightings
-        if isinstance(one, Marking) and one.covariance_m2 is not None:
-            assert told[told.index("accuracy") + 1] == one.accuracy
-            matrix = np.reshape(told[told.index("covariance_m2") + 1 :], (8, 8))
-            np.testing.assert_array_equal(matrix, in_ring_order(one.covariance_m2, one))
+        count = len(xyz(feature))
+        np.testing.assert_allclose(got[:count], xyz(feature)[ring(feature)], atol=TENTH_OF_A_MM)
+        values = [value for _, value in line.get_xdata("V2HDM")]
+        assert features(hd_map)[values[values.index("id") + 1]] is feature
+        assert values[values.index("sightings") + 1] == feature.sightings
+        if isinstance(feature, Marking) and feature.covariance_m2 is not None:
+            assert values[values.index("accuracy") + 1] == feature.accuracy
+            matrix = np.reshape(values[values.index("covariance_m2") + 1 :], (8, 8))
+            np.testing.assert_array_equal(matrix, in_ring_order(feature.covariance_m2, feature))
 
 
 def load(path, origin):
@@ -222,38 +231,38 @@ def routing(loaded):
 def test_every_marking_and_line_is_found_through_lanelet2(tmp_path, origin):
     hd_map = street(origin)
     loaded = load(exported(tmp_path, "lanelet2", hd_map), origin)
-    for number, one in features(hd_map).items():
-        if not isinstance(one, Marking):
+    for number, feature in features(hd_map).items():
+        if not isinstance(feature, Marking):
             line = loaded.lineStringLayer[number]
-            np.testing.assert_allclose(points_of(line)[:, :2], xyz(one)[:, :2], atol=TENTH_OF_A_MM)
+            np.testing.assert_allclose(points_of(line)[:, :2], xyz(feature)[:, :2], atol=TENTH_OF_A_MM)
             assert line.attributes["type"] == "line_thin"
-            assert line.attributes["subtype"] == ("dashed" if one.kind == "lane_dash" else "solid")
-            assert line.attributes["lane_change"] == ("yes" if one.kind == "lane_dash" else "no")
+            assert line.attributes["subtype"] == ("dashed" if feature.kind == "lane_dash" else "solid")
+            assert line.attributes["lane_change"] == ("yes" if feature.kind == "lane_dash" else "no")
             continue
         polygon = loaded.polygonLayer[number]
         corners = points_of(polygon)
         assert corners.shape == (4, 3)
-        np.testing.assert_allclose(corners[:, :2], xyz(one)[ring(one), :2], atol=TENTH_OF_A_MM)
+        np.testing.assert_allclose(corners[:, :2], xyz(feature)[ring(feature), :2], atol=TENTH_OF_A_MM)
         (x, y), (ahead_x, ahead_y) = corners[:, :2].T, np.roll(corners[:, :2], -1, axis=0).T
         assert x @ ahead_y - y @ ahead_x > 0
         assert polygon.attributes["type"] == "pose_marker"
-        assert polygon.attributes["subtype"] == one.kind
+        assert polygon.attributes["subtype"] == feature.kind
         assert polygon.attributes["marker_id"] == str(number)
-        assert one.covariance_m2 is not None
+        assert feature.covariance_m2 is not None
         covariance = yaml.safe_load(polygon.attributes["covariance_m2"])
-        np.testing.assert_array_equal(covariance, in_ring_order(one.covariance_m2, one))
-        assert polygon.attributes["sightings"] == str(one.sightings)
-        assert polygon.attributes["accuracy"] == one.accuracy
+        np.testing.assert_array_equal(covariance, in_ring_order(feature.covariance_m2, feature))
+        assert polygon.attributes["sightings"] == str(feature.sightings)
+        assert polygon.attributes["accuracy"] == feature.accuracy
         heights = [float(point.attributes["local_x"]) for point in polygon]
-        np.testing.assert_array_equal(heights, xyz(one)[ring(one), 0])
+        np.testing.assert_array_equal(heights, xyz(feature)[ring(feature), 0])
 
 
 @BOTH
 def test_heights_are_ellipsoidal_or_local_as_the_projector_says(tmp_path, origin):
     hd_map = street(origin)
     path = exported(tmp_path, "lanelet2", hd_map)
-    z = np.concatenate([points_of(one)[:, 2] for one in load(path, origin).polygonLayer])
-    expected = np.concatenate([xyz(one)[ring(one), 2] for one in hd_map.markings])
+    z = np.concatenate([points_of(polygon)[:, 2] for polygon in load(path, origin).polygonLayer])
+    expected = np.concatenate([xyz(marking)[ring(marking), 2] for marking in hd_map.markings])
     if origin is None:  # the nodes lie at height 0 of the map, and lanelet2 puts 0 at the ellipsoid
         z = np.array([float(node.find("tag[@k='ele']").get("v")) for node in nodes(path)])
         expected = np.array([height for height in z if 0.9 < height < 3.0])
@@ -283,8 +292,8 @@ def test_a_stop_line_has_the_regulatory_element_that_the_map_validator_asks_for(
     west = corners[np.argsort(corners[:, 0])[:2]]
     for end in points_of(line)[:, :2]:
         assert np.linalg.norm(west - end, axis=1).min() < TENTH_OF_A_MM
-    (lanelet,) = [one for one in loaded.laneletLayer if one.regulatoryElements]
-    assert [one.id for one in lanelet.regulatoryElements] == [rule.id]
+    (lanelet,) = [candidate for candidate in loaded.laneletLayer if candidate.regulatoryElements]
+    assert [element.id for element in lanelet.regulatoryElements] == [rule.id]
     assert lanelet.leftBound.attributes["subtype"] == "dashed"
     assert lanelet.rightBound.attributes["subtype"] == "solid"
 
@@ -294,7 +303,7 @@ def test_lanes_between_two_lines_make_a_routing_graph_with_a_lane_change(tmp_pat
     assert len(loaded.laneletLayer) == 2
     rules, graph = routing(loaded)
     assert not list(graph.checkValidity())
-    left, right = sorted(loaded.laneletLayer, key=lambda one: one.leftBound.id)
+    left, right = sorted(loaded.laneletLayer, key=lambda lanelet: lanelet.leftBound.id)
     assert (left.leftBound.id, left.rightBound.id) == (6, 7)
     assert (right.leftBound.id, right.rightBound.id) == (7, 8)
     assert graph.right(left).id == right.id
@@ -307,13 +316,15 @@ def test_lanes_between_two_lines_make_a_routing_graph_with_a_lane_change(tmp_pat
 
 def test_lanelet2_ids_are_positive_unique_and_stay_when_another_feature_goes(tmp_path):
     hd_map = street()
-    known = HDMap(
-        tuple(replace(one, id=k + 1) for k, one in enumerate(hd_map.markings)),
-        tuple(replace(one, id=k + 6) for k, one in enumerate(hd_map.lanes)),
+    numbered = HDMap(
+        tuple(replace(marking, id=k + 1) for k, marking in enumerate(hd_map.markings)),
+        tuple(replace(lane, id=k + 6) for k, lane in enumerate(hd_map.lanes)),
         hd_map.origin,
     )
-    before = identified(exported(tmp_path / "before", "lanelet2", known))
-    after = identified(exported(tmp_path / "after", "lanelet2", replace(known, markings=known.markings[1:])))
+    before = identified(exported(tmp_path / "before", "lanelet2", numbered))
+    after = identified(
+        exported(tmp_path / "after", "lanelet2", replace(numbered, markings=numbered.markings[1:]))
+    )
     assert min(before) > 0
     assert len(before) - len(after) == 5  # a polygon and its nodes
     assert all(before[key] == text for key, text in after.items())
@@ -324,9 +335,9 @@ def identified(path):
     root = ET.parse(path).getroot()
     assert root[0].tag == "MetaInfo"
     assert set(root[0].attrib) == {"format_version", "map_version"}
-    found = [one for one in root if one.tag in ("node", "way", "relation")]
-    by_id = {int(one.get("id", "0")): ET.tostring(one) for one in found}
-    assert len(by_id) == len(found)
+    elements = [element for element in root if element.tag in ("node", "way", "relation")]
+    by_id = {int(element.get("id", "0")): ET.tostring(element) for element in elements}
+    assert len(by_id) == len(elements)
     return by_id
 
 
@@ -363,8 +374,8 @@ def test_mgrs_coordinates_are_those_of_utm_within_the_square(tmp_path):
     ],
 )
 def test_places_of_the_world_are_in_their_grid_squares(latitude_deg, longitude_deg, square, metres):
-    found, local = grid_places(np.array([longitude_deg]), np.array([latitude_deg]))
-    assert found == square
+    squares, local = grid_places(np.array([longitude_deg]), np.array([latitude_deg]))
+    assert squares == square
     np.testing.assert_allclose(local, [metres], atol=1.0)
 
 
@@ -400,9 +411,9 @@ def test_lines_bound_a_lane_where_a_truck_but_not_two_fit_between_them():
     assert not closed_lanes([line(0.0), line(2.0)])
     assert not closed_lanes([line(0.0), line(5.5)])
     assert not closed_lanes([line(0.0), line(7.0), line(0.3)])
-    (one,) = closed_lanes([line(0.0), line(3.5, -1)])
-    assert (one.left[0], one.right[0]) == (1, 0)
-    assert one.left[1][0] == len(x) - 1
+    (lane,) = closed_lanes([line(0.0), line(3.5, -1)])
+    assert (lane.left[0], lane.right[0]) == (1, 0)
+    assert lane.left[1][0] == len(x) - 1
     # A line between two others parts their lanes; a crossing stripe bounds none.
     across = np.column_stack([np.full(9, 20.0), np.linspace(0.5, 3.0, 9)])
     lanes = closed_lanes([line(0.0), line(3.5), line(7.0)])
@@ -444,15 +455,16 @@ def test_a_lane_beside_which_another_begins_is_cut_there_so_that_one_can_change(
 
     lines = (line("lane_line", 0.0, 0.0), line("lane_dash", 3.5, 0.2), line("lane_line", 7.0, 21.3))
     loaded = load(exported(tmp_path, "lanelet2", HDMap((), lines, ORIGIN)), ORIGIN)
-    before, beside, begun = sorted(
-        loaded.laneletLayer, key=lambda one: points_of(one.centerline)[:, :2].mean(axis=0) @ [1.0, 10.0]
+    before, beside, begins = sorted(
+        loaded.laneletLayer,
+        key=lambda lanelet: points_of(lanelet.centerline)[:, :2].mean(axis=0) @ [1.0, 10.0],
     )
     _, graph = routing(loaded)
-    assert [one.id for one in graph.following(before)] == [beside.id]
-    assert graph.left(beside).id == begun.id
-    assert graph.right(begun).id == beside.id
-    route = graph.getRoute(before, begun)
-    assert [one.id for one in route.shortestPath()] == [before.id, beside.id, begun.id]
+    assert [lanelet.id for lanelet in graph.following(before)] == [beside.id]
+    assert graph.left(beside).id == begins.id
+    assert graph.right(begins).id == beside.id
+    route = graph.getRoute(before, begins)
+    assert [lanelet.id for lanelet in route.shortestPath()] == [before.id, beside.id, begins.id]
     assert before.leftBound[-1].id == beside.leftBound[0].id
 
 
@@ -466,7 +478,7 @@ def _destinations(tmp_path, lines):
         lanes.append(Lane("lane_line", np.column_stack([x, y]), 3))
     loaded = load(exported(tmp_path, "lanelet2", HDMap((), tuple(lanes), ORIGIN)), ORIGIN)
     _, graph = routing(loaded)
-    firsts = [one for one in loaded.laneletLayer if not graph.previous(one)]
+    firsts = [lanelet for lanelet in loaded.laneletLayer if not graph.previous(lanelet)]
     routes = {}
     for first in firsts:
         begin = points_of(first.centerline)[0, :2].round().astype(int)

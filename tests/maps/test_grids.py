@@ -36,7 +36,10 @@ def exported(folder, name, crs=UTM, origin=HAMBURG):
 
 
 def expected():
-    return {k: in_utm(one.corners_map, one.heights_m) for k, one in enumerate(street().markings, start=1)}
+    return {
+        k: in_utm(marking.corners_map, marking.heights_m)
+        for k, marking in enumerate(street().markings, start=1)
+    }
 
 
 def is_rounded(values):
@@ -65,17 +68,17 @@ def test_csv_dxf_and_landxml_have_the_same_rounded_metres_and_state_datum_and_ep
     drawing = ezdxf.readfile(exported(tmp_path, "dxf"))
     assert not drawing.audit().errors
     assert dict(drawing.header.custom_vars) == {"crs": UTM, "datum": "ETRS89", "epoch": "2024.5"}
-    of_dxf = np.array([tuple(one) for one in drawing.modelspace()[0].points()])
+    of_dxf = np.array([tuple(vertex) for vertex in drawing.modelspace()[0].points()])
     root = ET.parse(exported(tmp_path, "landxml")).getroot()
     spaces = {"x": "http://www.landxml.org/schema/LandXML-1.2"}
     assert root.find("x:CoordinateSystem", spaces).attrib["epsgCode"] == "25832"
     labels = root.findall("x:PlanFeatures/x:PlanFeature[@name='1']//x:Property", spaces)
-    assert {one.get("label"): one.get("value") for one in labels}["accuracy"] == "A"
+    assert {label.get("label"): label.get("value") for label in labels}["accuracy"] == "A"
     starts = root.findall("x:PlanFeatures/x:PlanFeature[@name='1']//x:Start", spaces)
-    of_landxml = np.array([[float(value) for value in one.text.split()] for one in starts])[:, [1, 0, 2]]
-    for found in (of_csv, of_dxf, of_landxml):
-        np.testing.assert_allclose(found, expected()[1], atol=1e-4)
-        assert is_rounded(found)
+    of_landxml = np.array([[float(value) for value in start.text.split()] for start in starts])[:, [1, 0, 2]]
+    for values in (of_csv, of_dxf, of_landxml):
+        np.testing.assert_allclose(values, expected()[1], atol=1e-4)
+        assert is_rounded(values)
 
 
 @pytest.mark.parametrize("name", ["gpkg", "geojson"])

@@ -72,15 +72,15 @@ def colours(picture):
 
 @pytest.mark.parametrize("crs", [None, "EPSG:32651"])
 def test_qgis_itself_draws_the_project(result, crs):
-    found = subprocess.run([PYTHON_OF_QGIS, "-c", "import qgis.core"], capture_output=True, check=False)
-    if found.returncode:
+    qgis = subprocess.run([PYTHON_OF_QGIS, "-c", "import qgis.core"], capture_output=True, check=False)
+    if qgis.returncode:
         pytest.skip("needs QGIS, 1 GB: apt-get install python3-qgis")
     folder, _ = result
     write_map(street(), folder, "map", ["qgis"], crs=crs)
     offscreen = {**os.environ, "QT_QPA_PLATFORM": "offscreen", "PYTHONPATH": ""}
     drawn = [PYTHON_OF_QGIS, "-c", QGIS, folder / "map.qgs", folder / "drawn.png"]
-    done = subprocess.run(drawn, env=offscreen, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run(drawn, env=offscreen, capture_output=True, text=True, check=False, timeout=120)
+    assert process.returncode == 0, process.stderr
     count = colours(folder / "drawn.png")
     assert count((90, 90, 90)) > 100_000  # ground
     assert count((233, 180, 86)) > 200  # lane lines
@@ -91,17 +91,19 @@ def test_every_source_and_system_of_the_project_opens_and_is_relative(result, cr
     folder, _ = result
     write_map(street(), folder, "map", ["qgis"], crs=crs)
     root = ET.parse(folder / "map.qgs").getroot()
-    sources = {one.findtext("layername"): one for one in root.findall("projectlayers/maplayer")}
+    sources = {layer.findtext("layername"): layer for layer in root.findall("projectlayers/maplayer")}
     assert list(sources) == ["symbols", "lanes", "markings", "mosaic"]
-    for name, one in sources.items():
-        file, _, layer = one.findtext("datasource").partition("|layername=")
+    for name, element in sources.items():
+        file, _, layer = element.findtext("datasource").partition("|layername=")
         assert not Path(file).is_absolute()
-        system = CRS.from_wkt(one.findtext("srs/spatialrefsys/wkt"))
+        system = CRS.from_wkt(element.findtext("srs/spatialrefsys/wkt"))
         if name == "mosaic":
             with rasterio.open(folder / file) as data:
-                own = CRS.from_wkt(data.crs.to_wkt()).coordinate_operation.params
+                parameters = CRS.from_wkt(data.crs.to_wkt()).coordinate_operation.params
                 stated = system.coordinate_operation.params
-                np.testing.assert_allclose([one.value for one in own], [one.value for one in stated])
+                np.testing.assert_allclose(
+                    [parameter.value for parameter in parameters], [parameter.value for parameter in stated]
+                )
         else:
             assert pyogrio.read_info(folder / file, layer=layer)["crs"] == f"EPSG:{code}"
             assert system.to_epsg() == code
@@ -114,9 +116,9 @@ def test_the_mosaic_is_a_cloud_optimised_geotiff(result):
         assert data.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert data.overviews(1)[:2] == [2, 4]
         assert (data.height, data.width) == (canvas.rows, canvas.columns)
-        seen = data.dataset_mask()
-        assert not seen[: canvas.rows // 4].any()
-        assert seen[canvas.rows // 4 :].all()
+        is_covered = data.dataset_mask()
+        assert not is_covered[: canvas.rows // 4].any()
+        assert is_covered[canvas.rows // 4 :].all()
         assert np.abs(data.read(1)[canvas.rows // 2].astype(int) - 90).max() <= 2
 
 

@@ -304,29 +304,29 @@ def test_a_map_keeps_the_verdict_on_it(tmp_path, verdict):
     assert read_verdict(tmp_path / "map.geojson") == verdict
 
 
-@pytest.mark.parametrize(("sigma_s", "known"), [(0.001, True), (float("inf"), False)])
-def test_a_calibration_says_clock_read_out_time_and_verdict(tmp_path, sigma_s, known):
+@pytest.mark.parametrize(("sigma_s", "is_sigma_known"), [(0.001, True), (float("inf"), False)])
+def test_a_calibration_says_clock_read_out_time_and_verdict(tmp_path, sigma_s, is_sigma_known):
     calibration = Calibration(CALIBRATION.info, _looking_down())
     path = tmp_path / "front.yaml"
     write_calibration(calibration, path, clock_s=(0.06, sigma_s), read_out_s=(0.03, 0.0005), verdict=VERDICT)
     content = load_yaml(path, MapFileError)
     assert content["clock_offset_s"] == 0.06
     assert (content["read_out_s"], content["read_out_sigma_s"]) == (0.03, 0.0005)
-    assert ("clock_sigma_s" in content) is known
+    assert ("clock_sigma_s" in content) is is_sigma_known
     assert content["verdict"] == VERDICT
     np.testing.assert_allclose(read_calibration(path).cam_from_vehicle, _looking_down())
 
 
 def test_what_was_left_out_is_a_point_with_its_reason_and_is_read_back(tmp_path):
-    one = Exclusion("diamond", np.array([3.0, 4.0]), 2, "seen once", "front")
+    exclusion = Exclusion("diamond", np.array([3.0, 4.0]), 2, "seen once", "front")
     road = Road(np.array([[3.0, 4.0]]), np.array([46.2]), np.zeros((1, 2)))
-    write_exclusions([one], tmp_path / "excluded.geojson", None, road)
+    write_exclusions([exclusion], tmp_path / "excluded.geojson", None, road)
     (feature,) = json.loads((tmp_path / "excluded.geojson").read_text())["features"]
     assert feature["geometry"] == {"type": "Point", "coordinates": [3.0, 4.0, 46.2]}
-    write_exclusions([one], tmp_path / "wgs.geojson", GeodeticOrigin(48.0, 11.0, 500.0), None)
+    write_exclusions([exclusion], tmp_path / "wgs.geojson", GeodeticOrigin(48.0, 11.0, 500.0), None)
     for name in ("excluded", "wgs"):
         (read,) = read_exclusions(tmp_path / f"{name}.geojson")
-        np.testing.assert_array_equal(read.position_map, one.position_map)
+        np.testing.assert_array_equal(read.position_map, exclusion.position_map)
         assert (read.kind, read.sightings, read.reason, read.cameras) == ("diamond", 2, "seen once", "front")
     (feature,) = json.loads((tmp_path / "wgs.geojson").read_text())["features"]
     assert feature["geometry"]["coordinates"][:2] == pytest.approx([11.0, 48.0], abs=1e-3)

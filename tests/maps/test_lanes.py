@@ -53,13 +53,13 @@ def end_of_line(line):
 
 def lanelet_at(lanelets, place, which):
     """The lanelet outside crossings whose end (-1) or start (0) is there."""
-    near = [
+    close_lanelets = [
         lanelet
         for lanelet in lanelets.laneletLayer
         if np.linalg.norm(end_of(lanelet, which) - place) < NEAR_M
         and "turn_direction" not in lanelet.attributes
     ]
-    (lanelet,) = near
+    (lanelet,) = close_lanelets
     return lanelet
 
 
@@ -94,10 +94,10 @@ def test_lanelet2_routes_over_the_crossing_and_the_t(files, start, end, turns):
     first = lanelet_at(lanelets, start, 0)
     last = lanelet_at(lanelets, end, -1)
     path = routing(lanelets).getRoute(first, last).shortestPath()
-    told = [
+    turns_read = [
         lanelet.attributes["turn_direction"] for lanelet in path if "turn_direction" in lanelet.attributes
     ]
-    assert told == turns
+    assert turns_read == turns
 
 
 def test_no_route_turns_where_no_drive_did(files):
@@ -249,9 +249,9 @@ def test_a_course_passes_its_vertices_within_two_millimetres():
 def test_thinned_values_are_within_the_tolerance_everywhere():
     at = np.linspace(0.0, 100.0, 401)
     values = 0.5 * np.sin(at / 9.0)
-    kept = thinned(at, values, 1e-3)
-    assert len(kept) < 120
-    np.testing.assert_allclose(np.interp(at, at[kept], values[kept]), values, atol=1e-3)
+    rows = thinned(at, values, 1e-3)
+    assert len(rows) < 120
+    np.testing.assert_allclose(np.interp(at, at[rows], values[rows]), values, atol=1e-3)
     assert thinned(at, 3.0 - 0.02 * at, 1e-3) == [0, 400]
 
 

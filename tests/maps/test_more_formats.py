@@ -62,17 +62,19 @@ def assert_all_there(ids, points):
 
 def test_flatgeobufs_hold_every_feature_of_every_class(tmp_path):
     path = written(tmp_path, "flatgeobuf")
-    ids, points, known, classes = [], [], [], {}
+    ids, points, ids_with_sigma, classes = [], [], [], {}
     for file in sorted(path.parent.glob("*.fgb")):
         table, places, crs = rows_of(file)
         assert crs == "EPSG:4326"
         ids += table["id"].tolist()
         points += places
         classes |= dict(zip(table["id"], table["class"], strict=True))
-        known += table["id"][np.isfinite(table["sigma_m"])].tolist()
+        ids_with_sigma += table["id"][np.isfinite(table["sigma_m"])].tolist()
     assert_all_there(ids, points)
     assert classes == {feature.id: feature.kind for feature in features_of(site())}
-    assert sorted(known) == [feature.id for feature in features_of(site()) if feature.sigma_m is not None]
+    assert sorted(ids_with_sigma) == [
+        feature.id for feature in features_of(site()) if feature.sigma_m is not None
+    ]
     table, _, _ = rows_of(path.with_name("symbols.fgb"))
     assert table["text"].tolist() == ["EBH & 7"]
 

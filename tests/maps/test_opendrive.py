@@ -34,13 +34,13 @@ def away_m(points, line):
 def test_a_reader_finds_roads_between_the_lines_with_both_lines_where_they_are(tmp_path):
     hd_map = street()
     roads = loaded(written(tmp_path, hd_map))
-    lanes = closed_lanes([one.points_map for one in hd_map.lanes])
+    lanes = closed_lanes([lane.points_map for lane in hd_map.lanes])
     assert len(roads) == len(lanes) >= 2
     for road, lane in zip(roads, lanes, strict=True):
         (number, order), (across, _) = lane.left, lane.right
         assert away_m(hd_map.lanes[number].points_map[order], road.reference_line).max() < 0.06
         (section,) = road.lane_sections
-        (driven,) = [one for one in section.lanes if one.id == -1]
+        (driven,) = [lane for lane in section.lanes if lane.id == -1]
         assert driven.type == "driving"
         fine = np.concatenate(
             [np.linspace(a, b, 20) for a, b in itertools.pairwise(hd_map.lanes[across].points_map)]
@@ -90,12 +90,17 @@ def test_every_marking_is_an_object_with_its_corners_also_without_lanes(tmp_path
     path = written(tmp_path, hd_map)
     assert loaded(path)
     root = ET.parse(path).getroot()
-    told = {one.get("id"): one.find("userData[@code='accuracy']").get("value") for one in root.iter("object")}
-    assert told == {str(number): one.accuracy for number, one in enumerate(hd_map.markings, start=1)}
-    found = corners_of(root)
-    assert len(found) == len(hd_map.markings)
-    for number, one in enumerate(hd_map.markings, start=1):
-        gaps = np.linalg.norm(found[number][:, None] - one.corners_map, axis=2)
+    accuracies = {
+        element.get("id"): element.find("userData[@code='accuracy']").get("value")
+        for element in root.iter("object")
+    }
+    assert accuracies == {
+        str(number): marking.accuracy for number, marking in enumerate(hd_map.markings, start=1)
+    }
+    corners_of_id = corners_of(root)
+    assert len(corners_of_id) == len(hd_map.markings)
+    for number, marking in enumerate(hd_map.markings, start=1):
+        gaps = np.linalg.norm(corners_of_id[number][:, None] - marking.corners_map, axis=2)
         assert gaps.min(axis=0).max() < 1e-4
 
 

@@ -56,10 +56,10 @@ def drawn(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("qgis")
     hd_map = site(street().origin if request.param == "on earth" else None)
     *_, project = write_map(hd_map, folder, "map", ["qgis"])
-    done = run_qgis(SCRIPT, project, folder / "picture.png")
-    assert done.returncode == 0, done.stderr
+    process = run_qgis(SCRIPT, project, folder / "picture.png")
+    assert process.returncode == 0, process.stderr
     picture = cv2.imread(str(folder / "picture.png"))
-    return Drawn(json.loads(done.stdout.splitlines()[-1]), picture[..., ::-1])
+    return Drawn(json.loads(process.stdout.splitlines()[-1]), picture[..., ::-1])
 
 
 def test_qgis_reads_every_layer_in_a_system_of_metres_that_it_knows(drawn):

@@ -52,9 +52,11 @@ def test_csv_lanelet2_and_opendrive_name_what_words_say(tmp_path):
     ways = {way.get("id"): way for way in ET.parse(tmp_path / "lanelet2").getroot().iter("way")}
     tags = {tag.get("k"): tag.get("v") for tag in ways["7"].iter("tag")}
     assert (tags["text"], tags["text_confidence"], tags["text_alternative"]) == ("EBH", "0.9", "483")
-    objects = {one.get("id"): one for one in ET.parse(tmp_path / "opendrive").getroot().iter("object")}
+    objects = {
+        element.get("id"): element for element in ET.parse(tmp_path / "opendrive").getroot().iter("object")
+    }
     assert [objects[key].get("name") for key in "789"] == ["EBH", "12", "text"]
-    data = {one.get("code"): one.get("value") for one in objects["7"].iter("userData")}
+    data = {datum.get("code"): datum.get("value") for datum in objects["7"].iter("userData")}
     assert (data["class"], data["text_alternative"]) == ("text", "483")
 
 

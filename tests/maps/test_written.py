@@ -40,9 +40,9 @@ def folder(tmp_path):
     return tmp_path / "result"
 
 
-def assert_same(one, other):
-    for field in fields(one):
-        before, after = getattr(one, field.name), getattr(other, field.name)
+def assert_same(record, other):
+    for field in fields(record):
+        before, after = getattr(record, field.name), getattr(other, field.name)
         if isinstance(before, np.ndarray):
             np.testing.assert_array_equal(before, after, err_msg=field.name)
         elif isinstance(before, tuple) and before and hasattr(before[0], "kind"):

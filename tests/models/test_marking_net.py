@@ -54,8 +54,8 @@ def test_folding_the_normalisations_leaves_the_function_as_it_is():
         before = net(images)
         after = net.fold()(images)
     assert not any(isinstance(module, nn.BatchNorm2d) for module in net.modules())
-    for one, other in zip(after, before, strict=True):
-        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
+    for folded, other in zip(after, before, strict=True):
+        torch.testing.assert_close(folded, other, atol=1e-4, rtol=1e-4)
 
 
 def test_a_pixel_of_another_image_of_the_batch_changes_nothing(net):
@@ -63,5 +63,5 @@ def test_a_pixel_of_another_image_of_the_batch_changes_nothing(net):
     changed = images.clone()
     changed[1] = 255 - changed[1]
     with torch.inference_mode():
-        for one, other in zip(net(changed), net(images), strict=True):
-            torch.testing.assert_close(one[0], other[0])
+        for changed_output, other in zip(net(changed), net(images), strict=True):
+            torch.testing.assert_close(changed_output[0], other[0])

@@ -36,9 +36,9 @@ def test_a_mosaic_shows_the_ground_where_it_lies(drive, right):
     """Lens, mounting, pose, axes and weights in one: images made from the ground give that ground back."""
     canvas = Canvas(np.array([6.5, 2.5]), 0.02, 220, 240, right)
     rgba = whole(canvas, recorded_shots(drive), lenses(drive))
-    seen = rgba[..., 3] == 255
-    assert seen.mean() > 0.5
-    off = np.abs(rgba[..., 0].astype(float) - scene.waves(points_of(canvas)))[seen]
+    is_shown = rgba[..., 3] == 255
+    assert is_shown.mean() > 0.5
+    off = np.abs(rgba[..., 0].astype(float) - scene.waves(points_of(canvas)))[is_shown]
     assert np.median(off) < 1.0
     assert off.max() < 6.0
 
@@ -64,9 +64,9 @@ def test_ground_that_rises_is_shown_where_it_lies(tmp_path):
     for lift in (on_plane, None):
         shot = replace(flat, path=tmp_path / "rises.png", on_plane=lift)
         rgba = whole(canvas, [shot], lenses(drive))
-        seen = rgba[..., 3] == 255
-        assert seen.mean() > 0.3
-        off.append(np.abs(rgba[..., 0].astype(float) - scene.waves(points_of(canvas)))[seen].max())
+        is_shown = rgba[..., 3] == 255
+        assert is_shown.mean() > 0.3
+        off.append(np.abs(rgba[..., 0].astype(float) - scene.waves(points_of(canvas)))[is_shown].max())
     assert off[0] < 6.0 < 20.0 < off[1]
 
 
@@ -110,10 +110,10 @@ def test_the_own_vehicle_and_what_lies_too_far_away_are_left_out(drive):
     shot = recorded_shots(drive)[0]
     canvas = Canvas(np.array([2.0, 8.0]), 0.05, 320, 450)
     rgba, points = whole(canvas, [shot], {"front": lens}), points_of(canvas)
-    seen = rgba[..., 3] > 0
-    assert seen.any()
-    assert points[seen][:, 1].max() < 0.15
-    away_m = np.linalg.norm(points[seen] - camera_centre(scene.cam_from_vehicle())[:2], axis=1)
+    is_shown = rgba[..., 3] > 0
+    assert is_shown.any()
+    assert points[is_shown][:, 1].max() < 0.15
+    away_m = np.linalg.norm(points[is_shown] - camera_centre(scene.cam_from_vehicle())[:2], axis=1)
     assert REACH_M - 3.0 < away_m.max() < REACH_M + 0.5
 
 

@@ -1,6 +1,7 @@
 """Things that stand are not shown as ground: in made patterns, and in images of a box on a painted plane."""
 
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -20,12 +21,18 @@ FACE_X, FACE_Y, HEIGHT_M = 12.0, (1.0, 3.0), 2.0
 """A wall across the way, to its left: its place ahead, its ends aside, and its height, m."""
 
 
+@cache
 def noise(seed, size=4096):
     rng = np.random.default_rng(seed)
     return cv2.GaussianBlur(rng.uniform(40, 215, (size, size)).astype(np.float32), (0, 0), 1.2)
 
 
-GROUND_GREY, WALL_GREY = noise(1), noise(2)
+def ground_grey():
+    return noise(1)
+
+
+def wall_grey():
+    return noise(2)
 
 
 def grey_at(texture, points):
@@ -41,12 +48,12 @@ def picture(pose):
     v, u = np.mgrid[: scene.INFO.height, : scene.INFO.width]
     pixels = undistort_points(scene.INFO, np.stack([u, v], axis=-1).reshape(-1, 2).astype(float))
     points = apply_homography(ground_from_pinhole_px(scene.INFO.intrinsic, cam_from_map), pixels)
-    grey = grey_at(GROUND_GREY, points.reshape(*v.shape, 2)).ravel()
+    grey = grey_at(ground_grey(), points.reshape(*v.shape, 2)).ravel()
     share = (FACE_X - centre[0]) / (points[:, 0] - centre[0])
     y = centre[1] + share * (points[:, 1] - centre[1])
     z = centre[2] * (1 - share)
     on_wall = (share > 0) & (share < 1) & (y > FACE_Y[0]) & (y < FACE_Y[1]) & (z < HEIGHT_M)
-    wall = grey_at(WALL_GREY, np.column_stack([y, z]).reshape(*v.shape, 2)).ravel()
+    wall = grey_at(wall_grey(), np.column_stack([y, z]).reshape(*v.shape, 2)).ravel()
     grey[on_wall] = wall[on_wall]
     return np.repeat(grey.reshape(v.shape).astype(np.uint8)[..., None], 3, axis=2)
 
@@ -93,7 +100,9 @@ def test_a_wall_is_cut_out_and_the_ground_before_and_beside_it_is_shown(site):
     shown = rgba[..., 3] == 255
     column, row = np.meshgrid(np.arange(canvas.columns), np.arange(canvas.rows))
     points = canvas.corner_map + CELL_M * np.stack([column + 0.5, -(row + 0.5)], axis=-1)
-    off, aside = (np.abs(rgba[..., 0] - grey_at(GROUND_GREY, points + shift))[shown] for shift in (0.0, 0.5))
+    off, aside = (
+        np.abs(rgba[..., 0] - grey_at(ground_grey(), points + shift))[shown] for shift in (0.0, 0.5)
+    )
     assert np.median(off) < 8.0
     assert np.median(aside) > 2 * np.median(off)
 

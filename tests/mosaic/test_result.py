@@ -62,9 +62,9 @@ def test_the_projection_agrees_with_the_tangent_plane_to_a_millimetre():
     points = np.array([[x, y, 0.0] for x in (-2000, 0, 700, 2000) for y in (-2000, 0, 2000)], dtype=float)
     geodetic = geodetic_from_enu(scene.ORIGIN, points)
     to_grid = pyproj.Transformer.from_crs("EPSG:4326", crs_of(scene.ORIGIN), always_xy=True)
-    found = np.column_stack(to_grid.transform(geodetic[:, 1], geodetic[:, 0]))
-    near = np.linalg.norm(points, axis=1) <= 2001
-    assert np.abs(found - points[:, :2])[near].max() < 1e-3
+    projected = np.column_stack(to_grid.transform(geodetic[:, 1], geodetic[:, 0]))
+    is_near = np.linalg.norm(points, axis=1) <= 2001
+    assert np.abs(projected - points[:, :2])[is_near].max() < 1e-3
 
 
 def test_without_an_origin_the_geotiff_says_that_it_belongs_nowhere_on_the_earth(tmp_path):

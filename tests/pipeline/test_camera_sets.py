@@ -44,12 +44,12 @@ def elsewhere(monkeypatch):
     class Elsewhere(Executor):
         workers = 2
 
-        def outcomes(self, stage, given, progress, at_once):
+        def outcomes(self, stage, job_list, progress, at_once):
             assert at_once == 2
-            for number, job in enumerate(given):
+            for number, job in enumerate(job_list):
                 jobs.append(job[0])
-                there, job = pickle.loads(pickle.dumps((stage, job)))
-                yield number, pickle.loads(pickle.dumps(there.work(job, silent)))
+                stage_there, job = pickle.loads(pickle.dumps((stage, job)))
+                yield number, pickle.loads(pickle.dumps(stage_there.work(job, silent)))
 
     monkeypatch.setattr(stages._Work, "_map", mapped)
     return jobs, {1: HERE, 2: Elsewhere()}
@@ -63,9 +63,9 @@ def mapped_sets(cache, executor, detections, compare=True):
 
 def test_a_drive_is_mapped_with_all_cameras_alone_unless_sets_are_compared(elsewhere, tmp_path):
     jobs, executors = elsewhere
-    found = mapped_sets(tmp_path, executors[2], Images([0] * 5000), compare=False)
-    assert list(found) == ["all"]
-    assert found["all"].methods["Opt"].cameras == ("front", "left", "rear")
+    mapped = mapped_sets(tmp_path, executors[2], Images([0] * 5000), compare=False)
+    assert list(mapped) == ["all"]
+    assert mapped["all"].methods["Opt"].cameras == ("front", "left", "rear")
     assert jobs == []
 
 
@@ -75,14 +75,14 @@ def test_large_drives_are_mapped_by_processes_the_largest_set_first(
 ):
     caplog.set_level(logging.INFO, "v2hdm")
     jobs, executors = elsewhere
-    found = mapped_sets(tmp_path, executors[workers], Images([0] * count))
-    assert list(found) == ["front", "left", "rear", "all"]
-    assert found["all"].methods["Opt"].cameras == ("front", "left", "rear")
+    mapped = mapped_sets(tmp_path, executors[workers], Images([0] * count))
+    assert list(mapped) == ["front", "left", "rear", "all"]
+    assert mapped["all"].methods["Opt"].cameras == ("front", "left", "rear")
     assert jobs == (["all", "front", "left", "rear"] if workers * count == 10_000 else [])
     # What stands for processes logs here, too.
-    assert Counter(caplog.messages) == {f"mapped with {name}": 2 if jobs else 1 for name in found}
+    assert Counter(caplog.messages) == {f"mapped with {name}": 2 if jobs else 1 for name in mapped}
     caplog.clear()
     jobs.clear()
-    assert mapped_sets(tmp_path, executors[3 - workers], Images([0] * count)) == found
+    assert mapped_sets(tmp_path, executors[3 - workers], Images([0] * count)) == mapped
     assert not jobs
-    assert Counter(caplog.messages) == {f"mapped with {name}": 1 for name in found}
+    assert Counter(caplog.messages) == {f"mapped with {name}": 1 for name in mapped}

@@ -57,8 +57,8 @@ def corrected(small_mapped, small_drive, tmp_path_factory):
     path = folder / "corrections.yaml"
     write_corrections(said, str(result), path)
     changes = {"cache": str(cache), "map": MapConfig(corrections=str(path))}
-    made = run(run_config(small_drive, folder / "out", **changes))
-    return before, left_out, made
+    after = run(run_config(small_drive, folder / "out", **changes))
+    return before, left_out, after
 
 
 def longest_lane(folder):
@@ -80,40 +80,40 @@ def bare_place(markings, route_map):
 
 
 def nearest(markings, place):
-    return min(markings, key=lambda one: np.linalg.norm(one.corners_map.mean(axis=0) - place))
+    return min(markings, key=lambda marking: np.linalg.norm(marking.corners_map.mean(axis=0) - place))
 
 
 def test_rejected_markings_stay_out_with_the_reason_and_accepted_ones_come_in(corrected):
-    before, left_out, made = corrected
-    after = read_geojson(made.folder / "map.geojson").markings
+    before, left_out, result = corrected
+    after = read_geojson(result.folder / "map.geojson").markings
     middle = before[0].corners_map.mean(axis=0)
     assert np.linalg.norm(nearest(after, middle).corners_map.mean(axis=0) - middle) > 0.5
-    excluded = read_exclusions(made.folder / "excluded.geojson")
-    assert "rejected by a person: a manhole" in [one.reason for one in excluded]
+    excluded = read_exclusions(result.folder / "excluded.geojson")
+    assert "rejected by a person: a manhole" in [exclusion.reason for exclusion in excluded]
     came = nearest(after, left_out.position_map)
     assert np.linalg.norm(came.corners_map.mean(axis=0) - left_out.position_map) < 0.4
     assert len(after) == len(before) + 1  # one out, one in, one added
 
 
 def test_a_class_is_fixed_and_a_dragged_corner_is_where_it_was_put(corrected):
-    before, _, made = corrected
-    after = read_geojson(made.folder / "map.geojson").markings
+    before, _, result = corrected
+    after = read_geojson(result.folder / "map.geojson").markings
     assert nearest(after, before[1].corners_map.mean(axis=0)).kind == "crosswalk_bar"
     moved = nearest(after, before[2].corners_map.mean(axis=0))
     assert moved.corners_map[1] - before[2].corners_map[1] == pytest.approx([0.04, -0.03], abs=3e-3)
     assert moved.corners_map[[0, 2, 3]] == pytest.approx(before[2].corners_map[[0, 2, 3]], abs=0.02)
-    same = [nearest(after, one.corners_map.mean(axis=0)) for one in before[3:]]
+    same = [nearest(after, marking.corners_map.mean(axis=0)) for marking in before[3:]]
     off_m = [np.abs(a.corners_map - b.corners_map).max() for a, b in zip(same, before[3:], strict=True)]
     assert max(off_m) < 0.005
 
 
 def test_an_added_marking_is_in_the_map_and_the_images_say_that_nothing_is_painted_there(corrected):
-    before, _, made = corrected
-    bare = bare_place(before, read_tum(made.folder / "trajectory.tum").map_from_vehicle[:, :2, 3])
-    added = nearest(read_geojson(made.folder / "map.geojson").markings, bare.mean(axis=0))
+    before, _, result = corrected
+    bare = bare_place(before, read_tum(result.folder / "trajectory.tum").map_from_vehicle[:, :2, 3])
+    added = nearest(read_geojson(result.folder / "map.geojson").markings, bare.mean(axis=0))
     assert (added.kind, added.sightings) == ("diamond", 0)
     assert added.corners_map == pytest.approx(bare, abs=0.01)
-    heard = [entry for entry in made.metrics["corrections"] if entry["says"] == "added"]
+    heard = [entry for entry in result.metrics["corrections"] if entry["says"] == "added"]
     assert sorted(entry["against"] for entry in heard) == ["", "the images show paint on 0 % of it"]
 
 
@@ -132,15 +132,17 @@ def test_half_of_a_lane_line_that_was_split_and_deleted_is_left_where_the_images
 
 
 def test_an_added_marking_on_paint_that_the_images_show_is_where_they_show_it(corrected):
-    before, _, made = corrected
-    after = read_geojson(made.folder / "map.geojson").markings
+    before, _, result = corrected
+    after = read_geojson(result.folder / "map.geojson").markings
     again = nearest(after, before[3].corners_map.mean(axis=0))
     assert again.sightings == before[3].sightings
     assert again.corners_map == pytest.approx(before[3].corners_map, abs=0.005)
 
 
 def test_a_correction_of_nothing_is_a_finding_and_no_silence(corrected):
-    (finding,) = [one for one in corrected[2].verdict.findings if one.check == "corrections"]
+    (finding,) = [
+        candidate for candidate in corrected[2].verdict.findings if candidate.check == "corrections"
+    ]
     assert "1 of 9 match no candidate" in finding.says
     assert "diamond at (500.00, 500.00)" in finding.says
 
@@ -158,11 +160,11 @@ def test_what_the_map_follows_is_listed_beside_what_the_images_show(corrected):
         "deleted",
     }
     assert listed["of class crosswalk_bar"] == ""
-    told = [line for line in corrected[2].headlines if line.startswith("correction followed: ")]
-    assert len(told) == 8
-    assert any("rejected" in line for line in told)
+    headlines = [line for line in corrected[2].headlines if line.startswith("correction followed: ")]
+    assert len(headlines) == 8
+    assert any("rejected" in line for line in headlines)
     log = (corrected[2].folder / "run.log").read_text()
-    assert all(line in log for line in told)
+    assert all(line in log for line in headlines)
     (finding,) = [f for f in corrected[2].verdict.findings if f.check == "corrections against images"]
     against = [says for says in listed.values() if says]
     assert finding.value == len(against)
@@ -206,14 +208,18 @@ def test_a_dragged_corner_has_the_error_of_the_others_and_its_own():
     common = 0.03**2 * np.tile(np.eye(2), (4, 4)) + 0.001**2 * np.eye(8)
     shift = np.array([0.2, -0.1])  # of the whole map since the person saw it
     now = Candidates((square + shift)[None], common[None])
-    one = Correction(says=CORRECTED, kind="diamond", outline_map=square.tolist(), moved={3: [1.1, 1.2]})
-    placed = Stated({}, {0: one}).placed(now, now)
+    correction = Correction(
+        says=CORRECTED, kind="diamond", outline_map=square.tolist(), moved={3: [1.1, 1.2]}
+    )
+    placed = Stated({}, {0: correction}).placed(now, now)
     assert placed.corners_map[0, 2] == pytest.approx(np.array([1.1, 1.2]) + shift)
     assert placed.corners_map[0, [0, 1, 3]] == pytest.approx(square[[0, 1, 3]] + shift)
     block = placed.covariance_m2[0][4:6, 4:6]
     assert block == pytest.approx((0.03**2 + 0.001**2 / 3 + 0.02**2) * np.eye(2))
-    apart = np.kron([0, -1, 1, 0], np.eye(2))  # of two corners the common error cancels
-    assert np.sqrt(np.trace(apart @ placed.covariance_m2[0] @ apart.T) / 2) == pytest.approx(0.02, abs=2e-3)
+    difference = np.kron([0, -1, 1, 0], np.eye(2))  # of two corners the common error cancels
+    assert np.sqrt(np.trace(difference @ placed.covariance_m2[0] @ difference.T) / 2) == pytest.approx(
+        0.02, abs=2e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -239,19 +245,19 @@ def test_a_damaged_file_names_its_entry(change, says, tmp_path):
 def test_what_is_written_is_read_back(tmp_path):
     outline = [[0.0, 1.0], [1.0, 1.0], [1.0, 2.0], [0.0, 2.0]]
     moved = {"moved": {2: [1.25, 1.0]}, "sigma_m": 0.01}
-    one = Correction(
+    correction = Correction(
         says=CORRECTED, kind="diamond", marking=4, outline_map=outline, new_kind="arrow", **moved
     )
-    write_corrections([one], "outputs/port1", tmp_path / "corrections.yaml")
-    assert read_corrections(tmp_path / "corrections.yaml") == [one]
+    write_corrections([correction], "outputs/port1", tmp_path / "corrections.yaml")
+    assert read_corrections(tmp_path / "corrections.yaml") == [correction]
 
 
 def test_answers_on_lanes_are_told_and_one_without_a_lane_is_a_warning(corrected):
-    _, _, made = corrected
-    answered = [entry for entry in made.metrics["corrections"] if entry["says"].startswith("answered")]
+    _, _, result = corrected
+    answered = [entry for entry in result.metrics["corrections"] if entry["says"].startswith("answered")]
     assert [entry["place"] for entry in answered] == ["line at (1.00, 2.00)", "direction at (902.50, 0.00)"]
     assert answered[0]["against"] == ""
     assert "no lane lies at (900.0, 0.0)" in answered[1]["against"]
-    (finding,) = [finding for finding in made.verdict.findings if finding.check == "answers on lanes"]
+    (finding,) = [finding for finding in result.verdict.findings if finding.check == "answers on lanes"]
     assert finding.status.value == "WARN"
     assert "1 of 2 cannot be followed" in finding.says

@@ -49,19 +49,19 @@ class Work:
 
 def test_a_result_goes_to_its_place_and_is_kept_there(config, memory, tmp_path):
     work = Work()
-    made, kept = take_or_make(config, work, True, quiet)
-    assert (made.place, kept) == (f"{memory}/results/example", False)
-    there = memory.below("results/example")
-    assert there.read("maps/map.geojson") == str(config.mapping.max_range_m).encode()
+    first, is_kept = take_or_make(config, work, True, quiet)
+    assert (first.place, is_kept) == (f"{memory}/results/example", False)
+    place = memory.below("results/example")
+    assert place.read("maps/map.geojson") == str(config.mapping.max_range_m).encode()
     assert not (tmp_path / "local" / "uploads").exists()
     elsewhere = replace(config, cache=str(tmp_path / "other machine"))
-    taken, kept = take_or_make(elsewhere, work, True, quiet)
-    assert kept
-    assert (taken.place, taken.metrics, taken.verdict) == (made.place, made.metrics, made.verdict)
+    second, is_kept = take_or_make(elsewhere, work, True, quiet)
+    assert is_kept
+    assert (second.place, second.metrics, second.verdict) == (first.place, first.metrics, first.verdict)
     assert len(work.done) == 1
     nearer = replace(config, mapping=MappingOptions(max_range_m=9.0))
     assert not take_or_make(nearer, work, True, quiet)[1]
-    assert there.read("maps/map.geojson") == b"9.0"
+    assert place.read("maps/map.geojson") == b"9.0"
     assert not take_or_make(nearer, work, False, quiet)[1]
 
 
@@ -89,9 +89,9 @@ def test_what_another_finishes_meanwhile_is_taken(config, tmp_path):
         assert not take_or_make(elsewhere, first, True, quiet)[1]
         return second(local, cache)
 
-    made, kept = take_or_make(config, after_another, True, quiet)
-    assert kept
-    assert made.place.endswith("/results/example")
+    result, is_kept = take_or_make(config, after_another, True, quiet)
+    assert is_kept
+    assert result.place.endswith("/results/example")
     assert not (tmp_path / "local" / "uploads").exists()
 
 

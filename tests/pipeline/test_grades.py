@@ -104,17 +104,17 @@ def test_an_earlier_grade_goes_where_the_covariance_is_gone():
 
 
 @pytest.mark.parametrize(
-    ("asked", "left"),
+    ("least_accuracy", "left"),
     [("A", ["A", None, "A"]), ("B", ["A", "B", None, "A"]), ("C", ["A", "C", "B", None, "A", "C"])],
 )
-def test_what_is_of_a_worse_grade_than_asked_is_left_out_with_its_reason(asked, left):
+def test_what_is_of_a_worse_grade_than_asked_is_left_out_with_its_reason(least_accuracy, left):
     result = mapped()
-    chosen = without_worse(result, asked)
+    chosen = without_worse(result, least_accuracy)
     assert grades(chosen.hd_map) == left
     reasons = [exclusion.reason for exclusion in chosen.excluded]
     assert len(reasons) == len(grades(result.hd_map)) - len(left)
     assert set(reasons) <= LEFT_OUT_BY_GRADE
-    if asked == "B":
+    if least_accuracy == "B":
         assert set(reasons) == {"accuracy C, and mapping.acceptance.accuracy asks for B"}
         places = [exclusion.position_map for exclusion in chosen.excluded]
         np.testing.assert_allclose(
@@ -144,7 +144,7 @@ def test_a_give_way_line_has_the_first_id_of_its_pieces_and_all_others_keep_thei
     markings[3] = replace(markings[3], corners_map=pieces + np.array([0.0, 1.5]))
     result = replace(result, hd_map=replace(result.hd_map, markings=tuple(markings)))
     composed = with_composed({"front": {"Opt": result}}, GOAL_M)["front"]["Opt"]
-    assert [(one.kind, one.variety, one.id) for one in composed.hd_map.markings] == [
+    assert [(marking.kind, marking.variety, marking.id) for marking in composed.hd_map.markings] == [
         ("diamond", None, 3),
         ("stop_line", "give_way", 1),
     ]

@@ -54,8 +54,8 @@ def results(tmp_path_factory):
     def detected(drive, *_):
         out: list[ImageDetections] = []
         for session in drive.sessions:
-            found = scenes[session.root.name].detections
-            out += [replace(one, image=one.image + len(out)) for one in found]
+            of_session = scenes[session.root.name].detections
+            out += [replace(in_image, image=in_image.image + len(out)) for in_image in of_session]
         return out
 
     with pytest.MonkeyPatch.context() as patch:
@@ -76,27 +76,27 @@ def test_drives_are_mapped_together_each_with_its_trajectory(results):
     clocks = metrics["extrinsics"]["front"]["clock_offset_s"]
     assert set(clocks) == {"monday", "friday"}
     alone = json.loads((results / "monday" / "metrics.json").read_text())
-    sigma = [one["results"]["front"]["Opt"]["median_sigma_m"] for one in (metrics, alone)]
+    sigma = [figures["results"]["front"]["Opt"]["median_sigma_m"] for figures in (metrics, alone)]
     assert sigma[0] < sigma[1]
 
 
 def test_a_later_drive_lists_what_changed(results):
     changes = json.loads((results / "friday" / "metrics.json").read_text())["changes"]
-    fates = [one["fate"] for one in changes["listed"]]
+    fates = [change["fate"] for change in changes["listed"]]
     assert {Fate.MOVED.value, Fate.VANISHED.value} <= set(fates)
     features = json.loads((results / "friday" / "changes.geojson").read_text())["features"]
-    assert {one["properties"]["fate"] for one in features} >= set(fates)
+    assert {feature["properties"]["fate"] for feature in features} >= set(fates)
     before, after = (read_geojson(results / name / "map.geojson") for name in ("monday", "friday"))
-    gone = {one["id"] for one in changes["listed"] if one["fate"] == "vanished"}
-    assert {one.id for one in before.markings} - gone <= {one.id for one in after.markings}
+    gone = {change["id"] for change in changes["listed"] if change["fate"] == "vanished"}
+    assert {marking.id for marking in before.markings} - gone <= {marking.id for marking in after.markings}
     assert after.largest_id >= before.largest_id
 
 
 def test_a_map_that_was_brought_up_to_date_is_graded_by_its_new_covariances(results):
     before, after = (read_geojson(results / name / "map.geojson") for name in ("monday", "friday"))
-    for one in (*before.markings, *after.markings):
-        assert one.accuracy == accuracy_of(one.covariance_m2, ACCURACY_GOAL_CM / 100)
-    assert all(one.accuracy is not None for one in after.markings)
+    for marking in (*before.markings, *after.markings):
+        assert marking.accuracy == accuracy_of(marking.covariance_m2, ACCURACY_GOAL_CM / 100)
+    assert all(marking.accuracy is not None for marking in after.markings)
 
 
 def test_the_document_names_every_fate():
@@ -108,14 +108,14 @@ def test_a_base_that_nothing_can_be_built_on_is_refused(results, tmp_path):
     with pytest.raises(MapFileError, match=r"nowhere\.geojson"):
         read_base(tmp_path / "nowhere.geojson")
     hd_map = read_geojson(results / "monday" / "map.geojson")
-    naive = tuple(replace(one, covariance_m2=None) for one in hd_map.markings)
-    for changed, verdict, told in (
+    naive = tuple(replace(marking, covariance_m2=None) for marking in hd_map.markings)
+    for changed, verdict, message in (
         (hd_map, {"status": "FAIL"}, "the verdict on its drive is FAIL"),
         (replace(hd_map, markings=naive), None, "states no uncertainty of its markings"),
         (replace(hd_map, markings=()), None, "has no markings"),
     ):
         write_geojson(changed, tmp_path / "map.geojson", verdict)
-        with pytest.raises(MapFileError, match=told):
+        with pytest.raises(MapFileError, match=message):
             read_base(tmp_path)
 
 
@@ -125,8 +125,8 @@ def test_a_base_of_another_frame_or_site_is_refused(results):
     check_together(base, drive, "monday")
     with pytest.raises(MapFileError, match="their coordinates differ"):
         check_together(base, replace(drive, origin=GeodeticOrigin(50.0, 8.0, 100.0)), "monday")
-    far = [replace(one, map_from_vehicle=one.map_from_vehicle.copy()) for one in drive.images]
+    far = [replace(image, map_from_vehicle=image.map_from_vehicle.copy()) for image in drive.images]
     for image in far:
         image.map_from_vehicle[0, 3] += 500.0
-    with pytest.raises(MapFileError, match="it is of another site"):
+    with pytest.raises(MapFileError, match="it is a map of another site"):
         check_together(base, replace(drive, images=far), "monday")

@@ -36,8 +36,8 @@ def site(small_drive, small_mapped, tmp_path_factory):
 
 
 def config(folder, output, **changes):
-    given = {"cache": str(folder / "cache"), **changes}
-    return run_config(folder / "drive", folder / output, **given)
+    settings = {"cache": str(folder / "cache"), **changes}
+    return run_config(folder / "drive", folder / output, **settings)
 
 
 def assert_same(folder, other):
@@ -72,7 +72,9 @@ def test_another_mapping_setting_needs_no_image_again(site, monkeypatch):
     monkeypatch.setattr(batch, "detect_image", refused)
     monkeypatch.setattr(batch, "own_vehicles", refused)
     nearer = run(config(site, "nearer", mapping=MappingOptions(max_range_m=6.0)))
-    before, after = ((one / "map.geojson").read_bytes() for one in (site / "first" / "short", nearer.folder))
+    before, after = (
+        (folder / "map.geojson").read_bytes() for folder in (site / "first" / "short", nearer.folder)
+    )
     assert before != after
 
 
@@ -104,8 +106,8 @@ def test_a_finished_result_is_known_without_torch(site):
         f" mosaic=False, output={str(site / 'first')!r}, cache={str(site / 'cache')!r}))\n"
         "print('torch' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.stdout.strip() == "False", done.stderr
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert process.stdout.strip() == "False", process.stderr
 
 
 def remove_a_file(folder):
@@ -120,13 +122,15 @@ def cut_the_entries(folder):
 
 @pytest.mark.parametrize("harm", [remove_a_file, cut_the_entries])
 def test_what_is_missing_or_damaged_is_made_anew(site, harm, monkeypatch):
-    made: list[RunResult] = []
+    results: list[RunResult] = []
     before = (site / "first" / "short" / "map.geojson").read_bytes()
     harm(site / "first" / "short")
     original = running.map_and_save
-    monkeypatch.setattr(running, "map_and_save", lambda *given: made.append(original(*given)) or made[-1])
+    monkeypatch.setattr(
+        running, "map_and_save", lambda *arguments: results.append(original(*arguments)) or results[-1]
+    )
     run(config(site, "first"))
-    assert made
+    assert results
     assert (site / "first" / "short" / "map.geojson").read_bytes() == before
 
 
@@ -165,8 +169,8 @@ run(RunConfig(name="short", drive=drive, output=sys.argv[2], cache=sys.argv[3], 
 def test_a_killed_run_goes_on_in_the_middle_of_detection(site, monkeypatch):
     cache, output = site / "killed_cache", site / "killed"
     arguments = [str(site / "drive"), str(output), str(cache)]
-    done = subprocess.run([sys.executable, "-c", KILLED, *arguments], capture_output=True, timeout=300)
-    assert done.returncode == -signal.SIGKILL, done.stderr
+    process = subprocess.run([sys.executable, "-c", KILLED, *arguments], capture_output=True, timeout=300)
+    assert process.returncode == -signal.SIGKILL, process.stderr
     looked = seen_images(monkeypatch)
     resumed = run(config(site, "killed", cache=str(cache)))
     assert looked

@@ -76,9 +76,9 @@ def test_a_picture_of_another_place_costs_no_map_and_one_of_no_place_no_time(tin
     ) as dataset:
         dataset.write(np.full((3, 40, 40), 90, np.uint8))
     report = ReportConfig(background=str(away))
-    done = run(run_config(tiny_drive, tmp_path / "out", report=report))
-    assert "no picture lies under the report's map: " in (done.folder / "run.log").read_text()
-    assert '"background":null' in (done.folder / "report.html").read_text()
+    result = run(run_config(tiny_drive, tmp_path / "out", report=report))
+    assert "no picture lies under the report's map: " in (result.folder / "run.log").read_text()
+    assert '"background":null' in (result.folder / "report.html").read_text()
     lost = blind_copy(tiny_drive, tmp_path / "lost")
     with description(lost) as content:
         content.pop("origin")
@@ -102,7 +102,7 @@ def test_a_good_drive_passes_and_every_file_says_so(result):
     verdict = json.loads((result / "metrics.json").read_text())["verdict"]
     assert verdict["status"] == "PASS", verdict["findings"]
     assert {"heading", "clock", "ground match"} <= {
-        one["check"] for one in verdict["passed"] + verdict["unobservable"]
+        finding["check"] for finding in verdict["passed"] + verdict["unobservable"]
     }
     assert json.loads((result / "map.geojson").read_text())["v2hdm"]["verdict"]["status"] == "PASS"
     assert yaml.safe_load((result / "calibration_front.yaml").read_text())["verdict"]["status"] == "PASS"
@@ -126,11 +126,11 @@ def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(tin
 
 def test_the_optimisation_repairs_another_vehicles_calibration(result):
     metrics = json.loads((result / "metrics.json").read_text())
-    both = metrics["results"]["both"]
-    assert both["ENI"]["corner_rmse_m"] > 0.2
-    assert both["Opt"]["corner_rmse_m"] < 0.06
-    assert both["Opt"]["recall"] > 0.8  # a floor against breakage: 16 of 19 are found today
-    assert both["Opt"]["false_markings"] == 0
+    of_both = metrics["results"]["both"]
+    assert of_both["ENI"]["corner_rmse_m"] > 0.2
+    assert of_both["Opt"]["corner_rmse_m"] < 0.06
+    assert of_both["Opt"]["recall"] > 0.8  # a floor against breakage: 16 of 19 are found today
+    assert of_both["Opt"]["false_markings"] == 0
     for camera in ("front", "rear"):
         assert metrics["extrinsics"][camera]["rotation_error_deg"] < 0.2
 
@@ -149,8 +149,8 @@ def test_the_files_of_a_result_can_be_read_back(result):
         for ending, _ in CALIBRATION_FORMATS.values():
             text = (result / f"calibration_{camera}" / f"{camera}_{ending}").read_text()
             assert "# drive: short\n# date: " in text
-    for one in FORMATS.values():
-        assert (result / one.file.format(name="map")).stat().st_size > 1000
+    for map_format in FORMATS.values():
+        assert (result / map_format.file.format(name="map")).stat().st_size > 1000
     for picture in ("overlay_front.png", "overlay_rear.png", "mosaic_before_after.png"):
         image = cv2.imread(str(result / picture))
         assert image is not None, picture
@@ -276,9 +276,9 @@ def test_poses_that_were_laid_flat_are_written_at_their_recorded_height(tmp_path
     recorded = Trajectory(stamp_s, poses(46.2, 0.02))
     drive = Drive("d", tmp_path, {}, (), recorded=recorded)
     sigma = np.tile([0.01, 0.02, 0.003, 1e-4, 2e-4, 3e-4], (3, 1))
-    seen = np.array([True, False, True])
+    is_seen = np.array([True, False, True])
     session = np.zeros(len(stamp_s), dtype=np.int64)
-    adjusted = AdjustedPoses(stamp_s, poses(), poses(forward_m=0.05), sigma, seen, {}, session)
+    adjusted = AdjustedPoses(stamp_s, poses(), poses(forward_m=0.05), sigma, is_seen, {}, session)
     write_trajectories(adjusted, drive, tmp_path)
     got = read_tum(tmp_path / "trajectory.tum")
     np.testing.assert_allclose(got.stamp_s, stamp_s)

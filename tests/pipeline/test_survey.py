@@ -77,12 +77,14 @@ def site(small_drive, tmp_path_factory):
     noise = {"position_m": 0.062, "position_drift_m": 0.06, "position_drift_over_m": 150.0}
     with description(site.drive) as content:
         content["pose_noise"] |= noise
-    seen = [
-        m for m, own in zip(truth.map.markings, driven_past(drive, truth, ("front",)), strict=True) if own
+    driven_markings = [
+        m
+        for m, is_passed in zip(truth.map.markings, driven_past(drive, truth, ("front",)), strict=True)
+        if is_passed
     ]
-    chosen = np.random.default_rng(4).permutation(2 * len(seen))[:20].tolist()
-    corners = np.array([seen[n // 2].corners_map[2 * (n % 2)] for n in chosen])
-    kinds = [seen[n // 2].kind for n in chosen]
+    chosen = np.random.default_rng(4).permutation(2 * len(driven_markings))[:20].tolist()
+    corners = np.array([driven_markings[n // 2].corners_map[2 * (n % 2)] for n in chosen])
+    kinds = [driven_markings[n // 2].kind for n in chosen]
     (site.folder / "points.csv").write_text(survey(corners, kinds, drive.origin))
     (site.folder / "moved.csv").write_text(survey(corners, kinds, drive.origin, check_off_m=-0.08))
     only_check = (site.folder / "points.csv").read_text().replace("control", "check")
@@ -119,7 +121,7 @@ def test_the_documented_command_ends_in_a_table_a_line_and_a_finding(documented)
     assert figures(result)["rmse_m"] == pytest.approx(np.sqrt(np.mean(squared)), abs=1e-4)
     assert re.search(r"check points: \d+ of 10 compared, RMSE \d", " ".join(printed.split()))
     verdict = json.loads((result / "metrics.json").read_text())["verdict"]
-    passed = {one["check"]: one for one in verdict["passed"]}
+    passed = {finding["check"]: finding for finding in verdict["passed"]}
     assert {"check points", "survey frame", "surveyed points"} <= set(passed), verdict["findings"]
 
 
@@ -144,7 +146,7 @@ def test_check_points_touch_no_part_of_the_map(site, documented, tmp_path):
     for name in names:
         assert (moved.folder / name).read_bytes() == (documented[0] / name).read_bytes(), name
     assert figures(moved.folder)["rmse_m"] > 0.1
-    (finding,) = [one for one in moved.verdict.raised if one.check == "check points"]
+    (finding,) = [candidate for candidate in moved.verdict.raised if candidate.check == "check points"]
     assert "another datum or origin" in finding.says
 
 
@@ -159,8 +161,8 @@ def test_a_survey_in_the_wrong_frame_is_refused_before_any_long_work(site, tmp_p
 @pytest.mark.slow
 def test_control_points_that_match_no_corner_leave_the_map_in_the_frame_of_the_poses(site, tmp_path):
     unmatched = SurveyOptions(file=str(site.folder / "points.csv"), reach_m=1e-6)
-    made = run(site.config(tmp_path, unmatched))
-    assert "in the frame of the poses" in made.verdict.lines[0]
+    result = run(site.config(tmp_path, unmatched))
+    assert "in the frame of the poses" in result.verdict.lines[0]
 
 
 def test_a_survey_that_cannot_be_read_is_refused_before_the_drive_is(tmp_path):

@@ -25,8 +25,8 @@ def test_a_survey_without_pictures_is_mapped_and_reported(mapped):
     (opt,) = metrics["results"].values()
     assert opt["Opt"]["markings"] >= 20
     assert metrics["results"]["both"]["Opt"]["recall"] > 0.9
-    told = [finding for finding in result.verdict.findings if finding.check == "pictures"]
-    assert ["detections in place of pictures" in finding.line for finding in told] == [True]
+    of_pictures = [finding for finding in result.verdict.findings if finding.check == "pictures"]
+    assert ["detections in place of pictures" in finding.line for finding in of_pictures] == [True]
 
 
 def test_commands_that_need_pictures_say_so_in_one_line(mapped, survey, capsys):
@@ -71,6 +71,6 @@ def test_a_drive_is_mapped_in_sections_by_one_setting(survey, tmp_path):
     ],
 )
 def test_sections_that_cannot_be_are_refused_before_any_work(survey, tmp_path, capsys, words, says):
-    given = [f"drive.path={survey[0]}", f"cache={tmp_path}/c", f"output={tmp_path}/o", "workers=1"]
-    assert main(["map", *given, *words]) == 2
+    arguments = [f"drive.path={survey[0]}", f"cache={tmp_path}/c", f"output={tmp_path}/o", "workers=1"]
+    assert main(["map", *arguments, *words]) == 2
     assert says in capsys.readouterr().err

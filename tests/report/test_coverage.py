@@ -57,12 +57,12 @@ def test_the_ground_sample_distance_is_that_of_a_pixel_along_the_view():
 
 
 def test_two_directions_are_told_apart():
-    there = drive_of([0.0])
+    outward = drive_of([0.0])
     back = np.diag([-1.0, -1.0, 1.0, 1.0])
     back[0, 3] = 20.0
-    both = replace(there, images=[*there.images, replace(there.images[0], map_from_vehicle=back)])
-    assert at(coverage_of(there, {"front": MOUNTING}), 10.0, 0.0, "sectors") == 1
-    assert at(coverage_of(both, {"front": MOUNTING}), 10.0, 0.0, "sectors") == 2
+    both_ways = replace(outward, images=[*outward.images, replace(outward.images[0], map_from_vehicle=back)])
+    assert at(coverage_of(outward, {"front": MOUNTING}), 10.0, 0.0, "sectors") == 1
+    assert at(coverage_of(both_ways, {"front": MOUNTING}), 10.0, 0.0, "sectors") == 2
 
 
 def test_a_camera_that_looks_at_the_sky_covers_nothing():
@@ -94,8 +94,8 @@ def test_a_stretch_with_few_images_is_named_by_its_place_along_the_route():
 
 
 def test_check_says_how_finely_ground_is_seen_and_where_to_drive_again():
-    seen, again = ground_seen(drive_of([x for x in np.arange(0.0, 120.0) if not 40 < x < 75]), {})
-    assert re.fullmatch(r"ground: [\d,]+ m2 seen in 3 images or more, .*, at \d+ mm a pixel", seen)
+    ground_line, again = ground_seen(drive_of([x for x in np.arange(0.0, 120.0) if not 40 < x < 75]), {})
+    assert re.fullmatch(r"ground: [\d,]+ m2 seen in 3 images or more, .*, at \d+ mm a pixel", ground_line)
     assert re.match(r"drive again: from 5\d m to 7\d m along the route, ", again)
     (seen_alone,) = ground_seen(drive_of(np.arange(120.0)), {})
     assert seen_alone.startswith("ground: ")
@@ -103,10 +103,12 @@ def test_check_says_how_finely_ground_is_seen_and_where_to_drive_again():
 
 def marking(x_m, y_m, sigma_m, accuracy, shared=0.0, sightings=20):
     """A square whose corners err by ``sigma_m``, of which a share of the variance is common."""
-    own = (1 - shared) * np.eye(8) + shared * np.tile(np.eye(2), (4, 4))
+    correlation = (1 - shared) * np.eye(8) + shared * np.tile(np.eye(2), (4, 4))
     relative_m = sigma_m * np.sqrt((1 - shared) / 4)
     corners = SQUARE + np.array([x_m, y_m])
-    return Marking("diamond", corners, sightings, sigma_m**2 * own, float(relative_m), accuracy=accuracy)
+    return Marking(
+        "diamond", corners, sightings, sigma_m**2 * correlation, float(relative_m), accuracy=accuracy
+    )
 
 
 def test_weak_markings_are_gathered_by_place_with_what_helps():

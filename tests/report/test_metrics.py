@@ -151,7 +151,7 @@ def test_before_and_after_differ_in_dashes_and_not_in_colour_alone(tmp_path):
 def test_every_method_has_a_colour_of_its_own():
     for look in (style.WORDS, style.METHOD):
         assert set(look) == set(METHODS)
-        assert len({str(one) for one in look.values()}) == len(METHODS)
+        assert len({str(colour) for colour in look.values()}) == len(METHODS)
 
 
 def test_the_table_shows_every_method_and_camera_set_once():
@@ -163,9 +163,9 @@ def test_the_table_shows_every_method_and_camera_set_once():
 
 def test_a_check_point_is_of_the_nearest_corner_within_reach_and_the_others_say_why_not():
     table = checked(yard(), point(5.98, 0.06, "A"), point(6.2, 0.0, "B"), point(20.5, 7.0, "C"))
-    (one,) = table.compared
-    assert (one.point.id, one.marking, one.marking_id, one.corner) == ("A", 1, 2, 1)
-    np.testing.assert_allclose(one.off_m, [0.02, -0.06], atol=1e-12)
+    (compared,) = table.compared
+    assert (compared.point.id, compared.marking, compared.marking_id, compared.corner) == ("A", 1, 2, 1)
+    np.testing.assert_allclose(compared.off_m, [0.02, -0.06], atol=1e-12)
     reasons = {which.id: why for which, why in table.unmatched}
     assert reasons["B"] == "A fits the only corner within reach better, of diamond 2"
     assert reasons["C"].startswith("no corner within 0.25 m: the nearest, of diamond 5, is 6.02 m away, the")
@@ -178,10 +178,10 @@ def test_figures_are_those_of_map_minus_survey():
     assert figures["rmse_m"] == pytest.approx(np.sqrt((0.02**2 + 0.01**2 + 0.03**2) / 2))
     assert (figures["mean_x_m"], figures["mean_y_m"]) == pytest.approx((-0.01, -0.02))
     assert figures["degrees_of_freedom"] == 4
-    one = table.compared[0]
+    compared = table.compared[0]
     sigma_m = np.sqrt(OWN_M**2 + SHARED_M**2 + SURVEY_M**2)
-    assert one.normalised == pytest.approx(np.hypot(0.02, 0.01) / sigma_m)
-    assert one.is_inside
+    assert compared.normalised == pytest.approx(np.hypot(0.02, 0.01) / sigma_m)
+    assert compared.is_inside
     assert "2 of 2 compared, RMSE 2.6 cm, mean -1.0 cm in x and -2.0 cm in y" in table.headline
 
 
@@ -204,7 +204,7 @@ def test_heights_are_compared_where_both_have_them_and_said_not_to_be_otherwise(
     flat = yard()
     lifted = replace(flat, markings=tuple(replace(m, heights_m=np.full(4, 2.0)) for m in flat.markings))
     table = checked(lifted, point(0.0, 0.0, "A", height_m=1.9), point(5.0, 0.0, "B"))
-    assert [one.off_height_m for one in table.compared] == [pytest.approx(0.1), None]
+    assert [compared.off_height_m for compared in table.compared] == [pytest.approx(0.1), None]
     height = {"compared": 1, "mean_z_m": pytest.approx(0.1), "rmse_z_m": pytest.approx(0.1)}
     assert table.figures()["height"] == height
     assert checked(flat, point(0.0, 0.0, "A", height_m=1.9)).figures()["height"]["compared"] == 0

@@ -111,14 +111,14 @@ def test_a_link_to_what_we_wrote_is_the_users_and_kept(tmp_path):
 
 
 def test_nothing_is_written_through_a_link_in_the_place_of_a_folder_of_ours(tmp_path):
-    there = tmp_path / "there"
-    with listed_files(there, "--output", MADE):
-        replace_text(there / "deep" / "a", "first")
-    (there / "deep").rename(tmp_path / "elsewhere")
-    (there / "deep").symlink_to("../elsewhere")
+    folder = tmp_path / "there"
+    with listed_files(folder, "--output", MADE):
+        replace_text(folder / "deep" / "a", "first")
+    (folder / "deep").rename(tmp_path / "elsewhere")
+    (folder / "deep").symlink_to("../elsewhere")
     refused = pytest.raises(ConfigError, match="a link is not replaced")
-    with refused, listed_files(there, "--output", MADE):
-        replace_text(there / "deep" / "a", "second")
+    with refused, listed_files(folder, "--output", MADE):
+        replace_text(folder / "deep" / "a", "second")
     assert (tmp_path / "elsewhere" / "a").read_text() == "first"
 
 

@@ -26,8 +26,8 @@ def yard(rng: np.random.Generator | None = None, count: int = 12) -> HDMap:
     shared = np.zeros(2) if rng is None else SHARED_M * rng.standard_normal(2)
     markings = []
     for k in range(count):
-        own = np.zeros((4, 2)) if rng is None else OWN_M * rng.standard_normal((4, 2))
-        markings.append(Marking("diamond", SQUARE + np.array([5.0 * k, 0.0]) + shared + own, 9))
+        scatter_m = np.zeros((4, 2)) if rng is None else OWN_M * rng.standard_normal((4, 2))
+        markings.append(Marking("diamond", SQUARE + np.array([5.0 * k, 0.0]) + shared + scatter_m, 9))
     return HDMap(tuple(markings))
 
 

@@ -181,11 +181,11 @@ def test_tiles_of_every_kind_lie_where_they_belong(ending, tmp_path):
 
 def test_pictures_of_no_place_on_the_earth_or_of_no_colours_are_refused_before_any_work(tmp_path):
     local = 'LOCAL_CS["site",UNIT["metre",1]]'
-    for name, changes, told in (
+    for name, changes, reason in (
         ("local", {"crs": local}, "its coordinate system has no place on the earth"),
         ("complex", {"dtype": "complex64"}, "has pixels of type complex64"),
     ):
-        with pytest.raises(MapFileError, match=f"{name}.tif: {told}"):
+        with pytest.raises(MapFileError, match=f"{name}.tif: {reason}"):
             check_background(write_tif(tmp_path / f"{name}.tif", **changes))
 
 

@@ -23,8 +23,8 @@ def ask(function, *arguments):
 
 def test_the_answer_and_the_log_of_a_child_are_its_parents(caplog, capfd):
     with caplog.at_level(logging.INFO):
-        told = ask(work.answer, 1, "two", Path("three").name)
-    assert told == {"arguments": [1, "two", "three"], "heavy": []}
+        answer = ask(work.answer, 1, "two", Path("three").name)
+    assert answer == {"arguments": [1, "two", "three"], "heavy": []}
     assert [(record.name, record.getMessage()) for record in caplog.records] == [
         ("v2hdm.io.somewhere", "a line 1")
     ]
@@ -49,9 +49,9 @@ def test_a_child_works_where_its_parent_does_in_its_environment_and_in_a_scratch
         (tmp_path / name).mkdir()
         monkeypatch.chdir(tmp_path / name)
         monkeypatch.setenv("V2HDM_SAID", name)
-        told = ask(work.surroundings)
-        scratches.add(told.pop("temporary"))
-        assert told == {"folder": str(tmp_path / name), "said": name}
+        answer = ask(work.surroundings)
+        scratches.add(answer.pop("temporary"))
+        assert answer == {"folder": str(tmp_path / name), "said": name}
     assert len(scratches) == 2
     assert not any(Path(scratch).exists() for scratch in scratches)
 
@@ -138,14 +138,14 @@ in_child(work.wait, sys.argv[1], limits=Limits.of([]), where="a.bag", error=Driv
 def test_a_child_of_a_script_without_a_guard_ends_with_it_and_leaves_nothing(number, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    told = tmp_path / "told"
+    report_file = tmp_path / "told"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, [Path(__file__).parents[2]]))}
-    command = [sys.executable, str(script), str(told)]
+    command = [sys.executable, str(script), str(report_file)]
     parent = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, start_new_session=True
     )
-    wait_until(lambda: told.is_file() and told.read_text().count(" ") == 1)
-    child, scratch = told.read_text().split(" ")
+    wait_until(lambda: report_file.is_file() and report_file.read_text().count(" ") == 1)
+    child, scratch = report_file.read_text().split(" ")
     assert Path(scratch).is_dir()
     os.killpg(parent.pid, number)
     assert parent.communicate(timeout=60)[0] == b"once\n"

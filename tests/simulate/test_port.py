@@ -150,12 +150,12 @@ def test_correlated_noise_keeps_its_sigma_and_its_length():
 
 def test_disturbances_are_as_large_as_configured():
     config = RouteConfig(pieces=[[3000.0, 0.0]])
-    wanted = DisturbanceConfig()
-    driven = drive_along(build_route(config), config, wanted, np.random.default_rng(2))
+    configured = DisturbanceConfig()
+    driven = drive_along(build_route(config), config, configured, np.random.default_rng(2))
     recorded, inside = interpolate(driven.recorded, driven.stamp_s, 0.5)
     assert inside.all()
     tilt = np.rad2deg(driven.map_from_vehicle[:, 2, :2])
-    assert tilt.std(axis=0) == pytest.approx([wanted.roll_pitch_deg] * 2, rel=0.08)
+    assert tilt.std(axis=0) == pytest.approx([configured.roll_pitch_deg] * 2, rel=0.08)
     error = (recorded - driven.map_from_vehicle)[:, :2, 3]
     assert np.sqrt((error**2).mean()) > 0.009
     assert not np.isin(driven.stamp_s, driven.recorded.stamp_s).any()
@@ -250,8 +250,8 @@ def test_the_stated_drift_is_that_of_the_recorded_positions():
 
 def test_another_session_finds_the_same_paint_under_other_noise():
     first, second = build_port(tiny_port()), build_port(tiny_port(session=1))
-    for one, other in zip(first.hd_map.markings, second.hd_map.markings, strict=True):
-        np.testing.assert_array_equal(one.corners_map, other.corners_map)
+    for marking, other in zip(first.hd_map.markings, second.hd_map.markings, strict=True):
+        np.testing.assert_array_equal(marking.corners_map, other.corners_map)
     assert not np.allclose(first.driven.map_from_vehicle, second.driven.map_from_vehicle, atol=1e-6)
     camera = next(iter(first.cameras))
     assert (first.picture(camera, 0).image != second.picture(camera, 0).image).any()
@@ -285,9 +285,9 @@ def test_a_port_with_stencils_is_otherwise_the_same():
     plain, stencilled = build_port(tiny_port()), build_port(tiny_port(paint=PaintConfig(stencils=STENCILS)))
     before, after = plain.renderer.scene.paints, stencilled.renderer.scene.paints
     assert len(after) > len(before)
-    for one, other in zip(before, after, strict=False):
-        assert replace(one, polygon_map=0) == replace(other, polygon_map=0)  # type: ignore[arg-type]
-        np.testing.assert_array_equal(one.polygon_map, other.polygon_map)
+    for paint, other in zip(before, after, strict=False):
+        assert replace(paint, polygon_map=0) == replace(other, polygon_map=0)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(paint.polygon_map, other.polygon_map)
 
 
 def test_own_paint_has_labels_after_those_of_the_shipped_classes():

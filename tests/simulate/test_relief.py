@@ -42,11 +42,11 @@ def test_pixels_show_the_ground_that_their_rays_meet_first():
     relief = relief_of(waves)
     view = View(camera_rays(INFO), CAM_FROM_MAP, relief)
     field = intersect_ground(view)
-    near = field.below & (field.depth_m < 40.0)
-    points = np.stack([field.x_m[near], field.y_m[near]], axis=1).astype(np.float64)
-    seen = view.homogeneous_px(view.on_ground(points))
-    pixels = np.dstack([view.rays.u_pinhole_px, view.rays.v_pinhole_px])[field.first_row :][near]
-    assert np.abs(seen[:, :2] / seen[:, 2:] - pixels).max() < 0.01
+    is_near = field.below & (field.depth_m < 40.0)
+    points = np.stack([field.x_m[is_near], field.y_m[is_near]], axis=1).astype(np.float64)
+    seen_px = view.homogeneous_px(view.on_ground(points))
+    pixels = np.dstack([view.rays.u_pinhole_px, view.rays.v_pinhole_px])[field.first_row :][is_near]
+    assert np.abs(seen_px[:, :2] / seen_px[:, 2:] - pixels).max() < 0.01
     assert np.ptp(relief.height_m(points)) > 0.7
     # No ground before it reaches up to the ray: behind crests there is ground that no pixel shows.
     some = np.random.default_rng(0).permutation(len(points))[:2000]
@@ -63,10 +63,10 @@ def test_a_painted_edge_lies_where_its_corners_on_the_ground_are_projected(centr
     paint = Paint(kind=DIAMOND, polygon_map=diamond, wear=0.0, dirt=0.0)
     scene = Scene(ground=BARE, paints=(paint,), relief=relief)
     rendered = Renderer(scene).render(INFO, CAM_FROM_MAP, np.random.default_rng(0), CLEAN)
-    seen = View(camera_rays(INFO), CAM_FROM_MAP, relief).homogeneous_px(
+    seen_px = View(camera_rays(INFO), CAM_FROM_MAP, relief).homogeneous_px(
         np.column_stack([diamond, relief.height_m(diamond)])
     )
-    corners = seen[:, :2] / seen[:, 2:]
+    corners = seen_px[:, :2] / seen_px[:, 2:]
     assert max(abs(edge_offset_px(rendered, corners[k], corners[(k + 1) % 4])) for k in range(4)) < 0.05
 
 
@@ -84,10 +84,10 @@ def test_truth_calls_points_hidden_that_lie_behind_a_box_on_a_slope_or_behind_a_
     at = row - field.first_row
     shows = np.hypot(field.x_m[at, column] - points[:, 0], field.y_m[at, column] - points[:, 1])
     shown = (shows < 3 * field.footprint_m[at, column]) & ~hidden[row, column]
-    seen = points_seen(INFO, CAM_FROM_MAP, points, [box], relief)
+    is_seen = points_seen(INFO, CAM_FROM_MAP, points, [box], relief)
     # Beside a crest a pixel shows metres, and points differ by its rounding.
-    assert (seen == shown).mean() > 0.95
-    assert (~seen).sum() > 300
+    assert (is_seen == shown).mean() > 0.95
+    assert (~is_seen).sum() > 300
     assert (~points_seen(INFO, CAM_FROM_MAP, points, [], relief)).sum() > 200
 
 
@@ -112,9 +112,9 @@ HILL = tiny_port(relief=ReliefConfig(grade=0.05, crown=0.03))
 def test_a_port_on_a_relief_is_the_flat_one_with_heights(hill):
     flat, port, drive = build_port(tiny_port()), build_port(HILL), read_drive(hill)
     truth, relief = read_truth(drive), port.renderer.scene.relief
-    for one, other in zip(truth.map.markings, flat.hd_map.markings, strict=True):
-        np.testing.assert_allclose(one.corners_map, other.corners_map, atol=1e-6)
-        np.testing.assert_allclose(one.heights_m, relief.height_m(one.corners_map), atol=1e-4)
+    for marking, other in zip(truth.map.markings, flat.hd_map.markings, strict=True):
+        np.testing.assert_allclose(marking.corners_map, other.corners_map, atol=1e-6)
+        np.testing.assert_allclose(marking.heights_m, relief.height_m(marking.corners_map), atol=1e-4)
     assert all(lane.heights_m is not None for lane in truth.map.lanes)
     z = np.unique(truth.map_from_vehicle[:, 2, 3])
     assert np.ptp(z) > 0.5

@@ -41,12 +41,12 @@ def test_a_stopped_render_is_no_drive_and_goes_on_where_it_was(tiny_drive, tmp_p
         render_drive(tiny_port(), folder, HERE, stop)
     with pytest.raises(DriveError):
         read_drive(folder)
-    kept = {path: path.stat().st_mtime_ns for path in folder.rglob("*.jpg")}
-    assert len(kept) == 7
-    seen: list[int] = []
-    render_drive(tiny_port(), folder, HERE, lambda done, total: seen.append(done))
-    assert seen[0] == 7
-    assert all(path.stat().st_mtime_ns == stamp for path, stamp in kept.items())
+    stamps = {path: path.stat().st_mtime_ns for path in folder.rglob("*.jpg")}
+    assert len(stamps) == 7
+    counts: list[int] = []
+    render_drive(tiny_port(), folder, HERE, lambda done, total: counts.append(done))
+    assert counts[0] == 7
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
     assert contents(folder) == contents(tiny_drive)
 
 
@@ -115,8 +115,8 @@ def edge_offset_px(rendered, a, b):
     # v points down, so the outside of a counter-clockwise polygon is on this side.
     outside = -(p[..., 0] * -along[1] + p[..., 1] * along[0]) * -1.0
     reach = 3.0
-    near = (np.abs(outside) < reach) & (position > 6) & (position < np.linalg.norm(b - a) - 6)
-    values, distance = linear(rendered.image)[near], outside[near]
+    is_near = (np.abs(outside) < reach) & (position > 6) & (position < np.linalg.norm(b - a) - 6)
+    values, distance = linear(rendered.image)[is_near], outside[is_near]
     bins = np.floor((distance + reach) * 4).astype(int)
     profile = np.array([values[bins == k].mean() for k in range(24)])
     share = (profile - profile[-3:].mean()) / (profile[:3].mean() - profile[-3:].mean())
@@ -174,11 +174,11 @@ def test_a_picture_is_a_function_of_scene_place_and_random_state():
     scene = Scene(ground=Ground(texture="asphalt", wet_fraction=0.2))
     noisy = Optics()
     renderer = Renderer(scene)
-    one, two, other = (
+    picture, two, other = (
         renderer.render(INFO, CAM_FROM_MAP, np.random.default_rng(seed), noisy).image for seed in (3, 3, 4)
     )
-    assert np.array_equal(one, two)
-    assert not np.array_equal(one, other)
+    assert np.array_equal(picture, two)
+    assert not np.array_equal(picture, other)
 
 
 def test_a_camera_that_looks_up_sees_only_sky():

@@ -34,11 +34,11 @@ def test_a_port_with_signs_is_otherwise_the_same(ports):
     plain, signed = ports
     before, after = plain.renderer.scene.paints, signed.renderer.scene.paints
     assert len(after) > len(before)
-    for one, other in zip(before, after, strict=False):
-        assert replace(one, polygon_map=0) == replace(other, polygon_map=0)  # type: ignore[arg-type]
-        np.testing.assert_array_equal(one.polygon_map, other.polygon_map)
-    for one, other in zip(plain.hd_map.markings, signed.hd_map.markings, strict=False):
-        np.testing.assert_array_equal(one.corners_map, other.corners_map)
+    for paint, other in zip(before, after, strict=False):
+        assert replace(paint, polygon_map=0) == replace(other, polygon_map=0)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(paint.polygon_map, other.polygon_map)
+    for paint, other in zip(plain.hd_map.markings, signed.hd_map.markings, strict=False):
+        np.testing.assert_array_equal(paint.corners_map, other.corners_map)
     assert not plain.hd_map.symbols
     assert not plain.texts
     np.testing.assert_array_equal(plain.driven.map_from_vehicle, signed.driven.map_from_vehicle)

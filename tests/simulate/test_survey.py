@@ -39,9 +39,9 @@ def test_no_marking_is_painted_over_another():
 
 def test_odd_drives_go_back_on_the_other_side():
     network = build_network(port(0.4), None)
-    there, back = network.way(0), network.way(1)
-    np.testing.assert_allclose(there.points_map[0], back.points_map[-1] - np.array([0.0, 1.6]), atol=1e-9)
-    assert np.cos(back.yaw_rad[-1] - there.yaw_rad[0]) == pytest.approx(-1.0)
+    outward, back = network.way(0), network.way(1)
+    np.testing.assert_allclose(outward.points_map[0], back.points_map[-1] - np.array([0.0, 1.6]), atol=1e-9)
+    assert np.cos(back.yaw_rad[-1] - outward.yaw_rad[0]) == pytest.approx(-1.0)
     middle = back.length_m / 2
     step = back.points_at(np.array([middle, middle + 0.1]))
     heading = np.arctan2(*np.diff(step, axis=0)[0][::-1])
@@ -107,23 +107,23 @@ def test_a_corner_errs_alike_in_different_images_as_the_detector_does():
     info = camera_info("front", camera)
     square = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
     ahead = HDMap((Marking("diamond", square, 0),))
-    there = np.eye(4)
-    there[0, 3] = -9.0
+    pose_there = np.eye(4)
+    pose_there[0, 3] = -9.0
     back = np.diag([-1.0, -1.0, 1.0, 1.0])
     back[0, 3] = 11.0
     products, squares = [], []
     for seed in range(1500):
         paint = Paint.of(ahead, 0.32, np.random.default_rng([seed, 2]))
-        both = []
-        for number, pose in enumerate((there, back)):
+        of_both = []
+        for number, pose in enumerate((pose_there, back)):
             cam_from_map = cam_from_vehicle(camera.mount) @ np.linalg.inv(pose)
             rng = np.random.default_rng([seed, number])
             shown = detect(paint, info, cam_from_map, rng)
-            both.append(whitened_errors(shown.markings, paint, info, cam_from_map))
-        if all(len(errors) for errors in both):
-            are_usual = np.all([np.linalg.norm(errors, axis=1) < 2.5 for errors in both], axis=0)
-            products.append((both[0] * both[1])[are_usual])
-            squares.append(np.square(both)[:, are_usual])
+            of_both.append(whitened_errors(shown.markings, paint, info, cam_from_map))
+        if all(len(errors) for errors in of_both):
+            are_usual = np.all([np.linalg.norm(errors, axis=1) < 2.5 for errors in of_both], axis=0)
+            products.append((of_both[0] * of_both[1])[are_usual])
+            squares.append(np.square(of_both)[:, are_usual])
     correlation = np.mean(np.concatenate(products)) / np.mean(np.concatenate(squares, axis=1))
     assert correlation == pytest.approx(0.32, abs=0.04)
 

@@ -23,18 +23,18 @@ JITTER_RAD = 0.002
 
 def symbols_of(outlines, kinds):
     """One outline in each frame of one camera, whose shutter is global."""
-    count, rows = len(outlines), tuple(np.zeros(len(one)) for one in outlines)
-    seen = tuple(np.ones(len(one), dtype=bool) for one in outlines)
+    count, rows = len(outlines), tuple(np.zeros(len(outline)) for outline in outlines)
+    seen_sides = tuple(np.ones(len(outline), dtype=bool) for outline in outlines)
     return Symbols(
-        np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds), rows, seen
+        np.zeros(count, dtype=np.int64), np.arange(count), tuple(outlines), tuple(kinds), rows, seen_sides
     )
 
 
 def of_outlines(symbols, outlines):
     """The symbols with other outlines, whose sides all lie along edges."""
-    seen = tuple(np.ones(len(one), dtype=bool) for one in outlines)
-    rows = tuple(np.zeros(len(one)) for one in outlines)
-    return replace(symbols, outlines_pinhole_px=tuple(outlines), row_shares=rows, seen_sides=seen)
+    seen_sides = tuple(np.ones(len(outline), dtype=bool) for outline in outlines)
+    rows = tuple(np.zeros(len(outline)) for outline in outlines)
+    return replace(symbols, outlines_pinhole_px=tuple(outlines), row_shares=rows, seen_sides=seen_sides)
 
 
 def seen(shapes, kinds, poses_x):
@@ -47,7 +47,7 @@ def seen(shapes, kinds, poses_x):
         places_x, frame = np.asarray(poses_x), np.arange(len(poses_x))
     rig = Rig(INTRINSIC[None], mounted([0.0, 0.0, 2.0])[None], level(places_x))
     poses = rig.map_from_vehicle[frame]
-    outlines_px = [outline_px(*one, rig.cam_from_vehicle[0]) for one in zip(shapes, poses, strict=True)]
+    outlines_px = [outline_px(*placed, rig.cam_from_vehicle[0]) for placed in zip(shapes, poses, strict=True)]
     return replace(symbols_of(outlines_px, kinds), frame=frame), rig
 
 
@@ -82,10 +82,12 @@ def noisy(outlines_px, rng):
         np.concatenate(
             [a + np.linspace(0, 1, 40, endpoint=False)[:, None] * (b - a) for a, b in pairwise(ring)]
         )
-        for ring in (np.vstack([one, one[:1]]) for one in outlines_px)
+        for ring in (np.vstack([outline, outline[:1]]) for outline in outlines_px)
     ]
-    waves = [np.convolve(rng.normal(0, 0.5 * np.sqrt(9), len(one)), np.ones(9) / 9, "same") for one in dense]
-    return tuple(one + wave[:, None] for one, wave in zip(dense, waves, strict=True))
+    waves = [
+        np.convolve(rng.normal(0, 0.5 * np.sqrt(9), len(points)), np.ones(9) / 9, "same") for points in dense
+    ]
+    return tuple(points + wave[:, None] for points, wave in zip(dense, waves, strict=True))
 
 
 def corner_errors_m(symbol, true):

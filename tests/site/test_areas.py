@@ -67,8 +67,8 @@ def test_an_area_is_the_rectangle_around_its_paint(kind):
 
 
 def test_images_that_cut_a_word_at_their_border_do_not_shrink_it():
-    near = word("EBHO", (7.0, 3.2), height_m=1.6)
-    symbols, rig = seen([hull(near)] * len(WAYS_M), ["text"] * len(WAYS_M), WAYS_M)
+    near_word = word("EBHO", (7.0, 3.2), height_m=1.6)
+    symbols, rig = seen([hull(near_word)] * len(WAYS_M), ["text"] * len(WAYS_M), WAYS_M)
     cut = clipped(symbols)
     areas_px = [
         abs(signed_area(now)) / abs(signed_area(before))
@@ -78,29 +78,31 @@ def test_images_that_cut_a_word_at_their_border_do_not_shrink_it():
     assert sum(share < 0.9 for share in areas_px) >= 3
     enough = np.array([share > 0.1 for share in areas_px])
     few = replace(
-        of_outlines(cut, [one for one, use in zip(cut.outlines_pinhole_px, enough, strict=False) if use]),
-        seen_sides=tuple(one for one, use in zip(cut.seen_sides, enough, strict=False) if use),
+        of_outlines(
+            cut, [outline for outline, use in zip(cut.outlines_pinhole_px, enough, strict=False) if use]
+        ),
+        seen_sides=tuple(sides for sides, use in zip(cut.seen_sides, enough, strict=False) if use),
         camera=cut.camera[: len(enough)][enough],
         frame=cut.frame[: len(enough)][enough],
         kinds=("text",) * int(enough.sum()),
     )
     (area,) = mapped(few, rig)
-    assert np.linalg.norm(errors_m(area, rectangle(near)), axis=1).max() < 0.03
+    assert np.linalg.norm(errors_m(area, rectangle(near_word)), axis=1).max() < 0.03
 
 
 def test_a_word_of_which_no_image_shows_one_side_has_no_place():
     symbols, rig = seen([hull(LETTERS)] * 6, ["text"] * 6, WAYS_M[:6])
     middle = [outline[:, 0].mean() for outline in symbols.outlines_pinhole_px]
     halves = [
-        np.column_stack([np.minimum(one[:, 0], u), one[:, 1]])
-        for one, u in zip(symbols.outlines_pinhole_px, middle, strict=True)
+        np.column_stack([np.minimum(outline[:, 0], u), outline[:, 1]])
+        for outline, u in zip(symbols.outlines_pinhole_px, middle, strict=True)
     ]
     sides = tuple(
         (half[:, 0] < u) & (np.roll(half[:, 0], -1) < u) for half, u in zip(halves, middle, strict=True)
     )
-    found, left_out = given_and_left_out(replace(of_outlines(symbols, halves), seen_sides=sides), rig)
-    assert not found
-    assert [one.reason for one in left_out] == [LACKS_A_CORNER]
+    areas, left_out = given_and_left_out(replace(of_outlines(symbols, halves), seen_sides=sides), rig)
+    assert not areas
+    assert [exclusion.reason for exclusion in left_out] == [LACKS_A_CORNER]
 
 
 def test_what_hides_a_part_in_a_third_of_the_images_does_not_shrink_a_word():
@@ -147,8 +149,8 @@ def test_the_corners_of_words_are_as_uncertain_as_they_are_stated():
 
 def test_letters_that_images_see_apart_are_one_word_in_images_that_see_them_together():
     whole, first = hull(LETTERS), hull(word("E", AT, height_m=1.2, yaw_deg=4.0))
-    rest = hull(word(" BHO", AT, height_m=1.2, yaw_deg=4.0))
-    shapes = [whole] * 5 + [first, rest, first, rest]
+    other_letters = hull(word(" BHO", AT, height_m=1.2, yaw_deg=4.0))
+    shapes = [whole] * 5 + [first, other_letters, first, other_letters]
     ways_m = [*WAYS_M[:5], 2.5, 2.5, 3.0, 3.0]
     (area,) = mapped(*seen(shapes, ["text"] * len(shapes), np.array(ways_m)))
     assert np.linalg.norm(errors_m(area, rectangle(LETTERS)), axis=1).max() < 0.03

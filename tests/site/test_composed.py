@@ -87,9 +87,9 @@ def test_two_lines_beside_each_other_become_one_double_line(left, right, backwar
     assert (double.kind, double.lines, double.id) == ("double_line", expected, 3)
     assert double.apart_m == pytest.approx(0.24)
     np.testing.assert_allclose(double.points_map[:, 1], 0.12)
-    one, other = double.painted
-    assert (one.kind, other.kind) == expected
-    assert sorted([one.points_map[0, 1], other.points_map[0, 1]]) == pytest.approx([0.0, 0.24])
+    left_line, other = double.painted
+    assert (left_line.kind, other.kind) == expected
+    assert sorted([left_line.points_map[0, 1], other.points_map[0, 1]]) == pytest.approx([0.0, 0.24])
 
 
 def test_a_line_is_double_only_as_long_as_another_runs_beside_it():

@@ -38,8 +38,8 @@ def row(count=4, kind="stop_line", step_m=DASH_M + GAP_M, piece=PIECE, first_id=
 def test_short_pieces_across_a_lane_are_one_give_way_line(kind):
     diamond = Marking("diamond", PIECE + np.array([40.0, 1.0]), 3, id=1)
     hd_map = composed(HDMap((diamond, *row(kind=kind)), LANES))
-    kept, line = hd_map.markings
-    assert kept is diamond
+    marking, line = hd_map.markings
+    assert marking is diamond
     assert (line.kind, line.variety, line.id, line.sightings) == ("stop_line", GIVE_WAY, 11, 7)
     np.testing.assert_allclose(np.ptp(line.corners_map, axis=0), [THICK_M, 3 * (DASH_M + GAP_M) + DASH_M])
     np.testing.assert_allclose(line.corners_map.min(axis=0), [19.8, 0.35])
@@ -73,7 +73,7 @@ def test_heights_of_its_corners_are_those_of_its_outer_pieces():
         (row(step_m=0.55), "the gaps are those of wear"),
         (row(piece=PIECE * [1, 3], step_m=2.2), "dashes of 1.5 m are a line of their own"),
         (
-            tuple(replace(one, corners_map=one.corners_map[:, ::-1]) for one in row()),
+            tuple(replace(piece, corners_map=piece.corners_map[:, ::-1]) for piece in row()),
             "it leads along the lane",
         ),
     ],

@@ -35,8 +35,8 @@ def test_without_corrections_all_lines_stay():
 
 
 def test_a_drawn_line_is_in_the_map_and_the_images_say_that_they_show_none():
-    (kept, drawn), heard = corrected([straight(0, 20)], said(ADDED, (0, 5), (10, 5)))
-    assert ends(kept) == [[0, 0], [20, 0]]
+    (line, drawn), heard = corrected([straight(0, 20)], said(ADDED, (0, 5), (10, 5)))
+    assert ends(line) == [[0, 0], [20, 0]]
     assert ends(drawn) == [[0, 5], [10, 5]]
     assert drawn.sigma_m == pytest.approx(0.02)
     assert heard == [("drawn", "the images show a line along 0 % of it")]

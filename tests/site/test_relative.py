@@ -116,5 +116,5 @@ def test_nothing_is_said_of_a_marking_alone_or_unseen():
 
 
 def test_the_first_neighbour_is_the_one_nearest_to_ten_metres():
-    near = neighbours(np.array([[0.0, 0.0], [3.0, 0.0], [9.0, 0.0], [14.0, 0.0], [60.0, 0.0]]))
-    assert [others.tolist() for others in near] == [[2, 3, 1], [3, 2, 0], [0, 1, 3], [1, 0, 2], []]
+    neighbours_of = neighbours(np.array([[0.0, 0.0], [3.0, 0.0], [9.0, 0.0], [14.0, 0.0], [60.0, 0.0]]))
+    assert [others.tolist() for others in neighbours_of] == [[2, 3, 1], [3, 2, 0], [0, 1, 3], [1, 0, 2], []]

@@ -65,12 +65,12 @@ def test_far_arrows_say_nothing():
 AT, OFF = np.array([9.0, 1.0]), np.array([0.1, 0.0])
 
 
-def overlap(one, other):
+def overlap(outline, other):
     """Intersection over union, by cells of a centimetre."""
-    low = np.minimum(one.min(axis=0), other.min(axis=0)) - 0.1
-    size = np.ceil((np.maximum(one.max(axis=0), other.max(axis=0)) + 0.1 - low) * 100).astype(int)
+    low = np.minimum(outline.min(axis=0), other.min(axis=0)) - 0.1
+    size = np.ceil((np.maximum(outline.max(axis=0), other.max(axis=0)) + 0.1 - low) * 100).astype(int)
     masks = []
-    for shape in (one, other):
+    for shape in (outline, other):
         mask = np.zeros(size[::-1], dtype=np.uint8)
         cv2.fillPoly(mask, [np.round((shape - low) * 100).astype(np.int32)], 1)
         masks.append(mask > 0)
@@ -93,9 +93,9 @@ def test_the_vertices_of_arrows_of_one_stencil_have_one_order():
     shapes = [shape for place in places for shape in [ARROW + place] * 4]
     symbols, rig = seen(shapes, ["arrow"] * 8, 2 * [0.0, 0.7, 1.4, 2.1])
     symbols = of_outlines(symbols, noisy(symbols.outlines_pinhole_px, rng))
-    arrows = sorted(mapped(symbols, rig), key=lambda one: one.outline_map[:, 0].mean())
-    off_m = [one.outline_map - place - ARROW[3] for one, place in zip(arrows, places, strict=True)]
-    assert len({int(np.linalg.norm(one, axis=1).argmin()) for one in off_m}) == 1
+    arrows = sorted(mapped(symbols, rig), key=lambda symbol: symbol.outline_map[:, 0].mean())
+    off_m = [arrow.outline_map - place - ARROW[3] for arrow, place in zip(arrows, places, strict=True)]
+    assert len({int(np.linalg.norm(differences, axis=1).argmin()) for differences in off_m}) == 1
     for arrow, place in zip(arrows, places, strict=True):
         assert corner_errors_m(arrow, ARROW + place).max() < 0.035
 
@@ -122,21 +122,21 @@ def test_chevrons_letters_and_own_symbols_have_the_vertices_of_their_template(sh
     places, ways_m = np.array([[8.5, 1.5], [9.5, -1.6]]), [0.0, 0.7, 1.4, 2.1, 2.8, 3.5]
     symbols, rig = seen([shape + at for at in places for _ in ways_m], ["parking_t"] * 12, 2 * ways_m)
     symbols = of_outlines(symbols, noisy(symbols.outlines_pinhole_px, np.random.default_rng(3)))
-    found = sorted(mapped(symbols, rig), key=lambda one: one.outline_map[:, 0].mean())
-    assert len(found) == len(places)
-    for symbol, at in zip(found, places, strict=True):
+    symbols_found = sorted(mapped(symbols, rig), key=lambda symbol: symbol.outline_map[:, 0].mean())
+    assert len(symbols_found) == len(places)
+    for symbol, at in zip(symbols_found, places, strict=True):
         assert corner_errors_m(symbol, shape + at).max() < 0.025
 
 
 def test_an_outline_that_no_simple_polygon_explains_is_left_out_by_class_and_reason(monkeypatch):
     bow = np.array([[7.0, 0.5], [8.2, 1.5], [8.2, 0.5], [7.0, 1.5]])
-    given = seen([bow] * 5, ["bow"] * 5, np.arange(5.0))
+    sighted = seen([bow] * 5, ["bow"] * 5, np.arange(5.0))
     for crossing in (None, Polygon(bow, *3 * [1e-6 * np.eye(8)], 0.0, 1.0)):
         if crossing:
-            monkeypatch.setattr("v2hdm.site.symbols.find_polygons", lambda *_, one=crossing: [one])
-        found, left_out = given_and_left_out(*given)
-        assert not found
-        assert [(one.kind, one.reason) for one in left_out] == [("bow", NO_POLYGON)]
+            monkeypatch.setattr("v2hdm.site.symbols.find_polygons", lambda *_, polygon=crossing: [polygon])
+        symbols, left_out = given_and_left_out(*sighted)
+        assert not symbols
+        assert [(exclusion.kind, exclusion.reason) for exclusion in left_out] == [("bow", NO_POLYGON)]
 
 
 def cut(place_m):
@@ -153,16 +153,16 @@ def test_where_other_paint_cuts_an_arrow_its_template_says_how_long_it_is_or_it_
         [0.0, 0.7, 1.4, 2.1],
         np.array([[10.0, y] for y in (1.0, -1.0, 2.0, 0.0, -2.0)][: 1 + others]),
     )
-    short, own = cut(-1.0)
+    short, own_sides = cut(-1.0)
     shapes = [short + places[0]] * 4 + [ARROW + at for at in places[1:] for _ in ways_m]
     symbols, rig = seen(shapes, ["arrow"] * len(shapes), (1 + others) * ways_m)
-    symbols = replace(symbols, seen_sides=tuple([own] * 4) + symbols.seen_sides[4:])
-    found, left_out = given_and_left_out(symbols, rig)
+    symbols = replace(symbols, seen_sides=tuple([own_sides] * 4) + symbols.seen_sides[4:])
+    arrows, left_out = given_and_left_out(symbols, rig)
     if others:
-        arrow = min(found, key=lambda one: np.linalg.norm(one.outline_map.mean(axis=0) - places[0]))
+        arrow = min(arrows, key=lambda symbol: np.linalg.norm(symbol.outline_map.mean(axis=0) - places[0]))
         assert corner_errors_m(arrow, ARROW + places[0]).max() < 0.05
     else:
-        assert (found, [one.reason for one in left_out]) == ((), [LACKS_A_CORNER])
+        assert (arrows, [exclusion.reason for exclusion in left_out]) == ((), [LACKS_A_CORNER])
 
 
 def test_an_arrow_whose_near_end_the_border_cuts_from_near_by_is_mapped_whole():
@@ -199,8 +199,8 @@ def test_the_class_is_what_most_sightings_say():
 
 def test_neighbours_are_symbols_of_their_own():
     bars = [np.array([[7.0, y], [9.0, y], [9.0, y + 0.4], [7.0, y + 0.4]]) for y in (-1.0, 0.0)]
-    found = mapped(*seen(bars * 3, ["chevron"] * 6, [0.0, 0, 1, 1, 2, 2]))
-    assert len(found) == 2
+    symbols = mapped(*seen(bars * 3, ["chevron"] * 6, [0.0, 0, 1, 1, 2, 2]))
+    assert len(symbols) == 2
 
 
 def test_what_is_far_seen_seldom_or_never_is_left_out():
@@ -239,8 +239,8 @@ def test_paint_that_is_a_marking_is_no_symbol():
 def test_a_window_of_the_lorry_ahead_is_no_symbol_and_the_reason_is_given(step_m, reason):
     way_m = step_m * np.arange(8)
     shapes = [ARROW + AT + [x, 0.0] for x in way_m]
-    found, (left_out,) = given_and_left_out(*seen(shapes, ["arrow"] * 8, way_m))
-    assert not found
+    symbols, (left_out,) = given_and_left_out(*seen(shapes, ["arrow"] * 8, way_m))
+    assert not symbols
     assert (left_out.kind, left_out.sightings, left_out.reason) == ("arrow", 8, reason)
 
 
@@ -248,12 +248,12 @@ def test_an_arrow_seen_from_both_sides_lies_on_the_ground():
     way_m = np.array([0.0, 2.0, 4.0, 14.0, 16.0, 18.0])
     symbols, rig = seen([ARROW + AT] * 6, ["arrow"] * 6, way_m)
     back = mounted([0.0, 0.0, 2.0], yaw_deg=180.0)
-    both = replace(rig, cam_from_vehicle=np.stack([rig.cam_from_vehicle[0], back]))
-    both = replace(both, intrinsic=np.stack([INTRINSIC, INTRINSIC]))
+    of_both = replace(rig, cam_from_vehicle=np.stack([rig.cam_from_vehicle[0], back]))
+    of_both = replace(of_both, intrinsic=np.stack([INTRINSIC, INTRINSIC]))
     behind = [outline_px(ARROW + AT, pose, back) for pose in rig.map_from_vehicle[3:]]
     symbols = of_outlines(symbols, (*symbols.outlines_pinhole_px[:3], *behind))
     symbols = replace(symbols, camera=np.array([0, 0, 0, 1, 1, 1]))
-    assert len(mapped(symbols, both)) == 1
+    assert len(mapped(symbols, of_both)) == 1
 
 
 WAYS_M = np.arange(0.0, 4.0, 0.5)
@@ -270,20 +270,20 @@ def with_ghost(images):
 
 
 def test_an_arrow_that_few_of_the_images_find_that_show_it_well_is_left_out_however_like_the_others():
-    found, left_out = given_and_left_out(*with_ghost(3))
-    assert len(found) == len(ROWS)
-    assert [(one.sightings, one.reason) for one in left_out] == [(3, FOUND_SELDOM)]
+    arrows, left_out = given_and_left_out(*with_ghost(3))
+    assert len(arrows) == len(ROWS)
+    assert [(exclusion.sightings, exclusion.reason) for exclusion in left_out] == [(3, FOUND_SELDOM)]
     assert len(mapped(*with_ghost(len(WAYS_M)))) == len(ROWS) + 1
 
 
 def test_an_arrow_known_to_decimetres_only_is_mapped_with_the_sigma_that_it_has():
     symbols, rig = seen([ARROW + np.array([13.0, 1.0])] * 4, ["arrow"] * 4, np.arange(4.0))
-    (near, far) = (
+    (near_arrows, far) = (
         map_symbols(symbols, rig, all_views(rig), CAMERAS, jitter_rad, (), AcceptanceOptions())
         for jitter_rad in (JITTER_RAD, 4 * JITTER_RAD)
     )
-    assert [len(found) for found, _ in (near, far)] == [1, 1]
-    assert far[0][0].sigma_m > 2 * near[0][0].sigma_m > 0.02
+    assert [len(arrows) for arrows, _ in (near_arrows, far)] == [1, 1]
+    assert far[0][0].sigma_m > 2 * near_arrows[0][0].sigma_m > 0.02
 
 
 def with_sides(symbols, outlines_px, seen_sides):
@@ -318,7 +318,7 @@ def test_the_foot_that_other_paint_hides_is_completed_by_the_template_within_its
     sides = 4 * [cut(-1.0)[1]] + 16 * [np.ones(7, dtype=bool)]
     symbols = with_sides(symbols, noisy(symbols.outlines_pinhole_px, rng), sides)
     arrow = min(
-        mapped(symbols, rig), key=lambda one: np.linalg.norm(one.outline_map.mean(axis=0) - places[0])
+        mapped(symbols, rig), key=lambda symbol: np.linalg.norm(symbol.outline_map.mean(axis=0) - places[0])
     )
     feet = [0, 6]
     assert corner_errors_m(arrow, painted[0])[feet].max() < 0.08

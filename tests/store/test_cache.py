@@ -91,7 +91,7 @@ def test_what_was_logged_while_it_was_made_is_logged_again(tmp_path, caplog):
     for _ in range(2):
         caplog.clear()
         assert StageCache(tmp_path).get_or_make("stage", KEY, int, make) == 3
-        assert [(one.name, one.levelno, one.message) for one in caplog.records] == [
+        assert [(record.name, record.levelno, record.message) for record in caplog.records] == [
             ("v2hdm.some", logging.WARNING, "mind the gap")
         ]
 
@@ -101,7 +101,7 @@ def test_a_cache_that_cannot_be_written_is_reported_once_and_work_goes_on(tmp_pa
     cache = StageCache(tmp_path / "cache")
     for value in ([1], [2]):
         assert made(cache, value) == value
-    assert len([one for one in caplog.records if "later runs cannot resume" in one.message]) == 1
+    assert len([record for record in caplog.records if "later runs cannot resume" in record.message]) == 1
 
 
 def test_a_process_killed_while_it_writes_leaves_the_entry_or_none(tmp_path):
@@ -141,12 +141,14 @@ class Kept:
     names: tuple[str, ...] = ()
 
 
-def same(one, other):
-    if isinstance(one, np.ndarray):
-        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
-    if is_dataclass(one):
-        return all(same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
-    return bool(one == other)
+def same(value, other):
+    if isinstance(value, np.ndarray):
+        return (
+            value.dtype == other.dtype and value.shape == other.shape and value.tobytes() == other.tobytes()
+        )
+    if is_dataclass(value):
+        return all(same(getattr(value, f.name), getattr(other, f.name)) for f in fields(value))
+    return bool(value == other)
 
 
 @given(
@@ -154,12 +156,12 @@ def same(one, other):
     array=npst.arrays(np.float64, npst.array_shapes(min_dims=0, max_dims=4, min_side=0)),
 )
 def test_every_bit_comes_back(number, array):
-    kept = Kept(
+    values = Kept(
         number, -3, array, {Reading.MIRRORED: 0.1}, {Path("a/b.jpg"): 4}, array[..., None], ("x", "ü")
     )
-    found = decode(encode(kept), Kept)
-    assert same(found, kept)
-    assert encode(found) == encode(kept)
+    decoded = decode(encode(values), Kept)
+    assert same(decoded, values)
+    assert encode(decoded) == encode(values)
 
 
 @pytest.mark.parametrize("kind", [np.bool_, np.uint8, np.int64, np.float32, np.complex128, ">f8"])
@@ -177,10 +179,10 @@ def test_what_the_stages_make_can_be_kept(kind):
 @given(st.binary(max_size=200))
 def test_bytes_of_anyone_are_a_value_of_the_type_or_refused(data):
     try:
-        found = decode(data, tuple[list[ImageDetections], GroundStatus])
+        decoded = decode(data, tuple[list[ImageDetections], GroundStatus])
     except CodecError:
         return
-    assert isinstance(found[1], GroundStatus)
+    assert isinstance(decoded[1], GroundStatus)
 
 
 def test_neither_pickles_nor_arrays_of_objects_are_read(tmp_path):
@@ -235,11 +237,11 @@ def test_what_was_not_used_for_longest_goes_first(cache):
 
 
 def test_what_is_not_ours_stays(cache):
-    own = cache / ".thesis.part"
-    own.mkdir()
-    os.utime(own, (1000, 1000))
+    foreign = cache / ".thesis.part"
+    foreign.mkdir()
+    os.utime(foreign, (1000, 1000))
     prune(cache, 0)
-    assert own.is_dir()
+    assert foreign.is_dir()
     assert not left(cache)
     assert (cache / "stages" / "detect" / "notes.txt").read_text() == "mine"
     assert (cache / "drive" / "image.jpg").is_file()
@@ -326,10 +328,10 @@ def test_a_rendered_drive_goes_but_for_what_the_user_put_there(tmp_path):
     (folder / "front" / "notes.txt").write_text("mine")
     (folder / "front" / "0.jpg").rename(tmp_path / "0.jpg")
     (folder / "front" / "0.jpg").symlink_to(tmp_path / "0.jpg")
-    (found,) = items_of(tmp_path)
-    assert (found.kind, found.path) == (DRIVES, folder)
-    assert found.size > 5000
-    found.remove()
+    (item,) = items_of(tmp_path)
+    assert (item.kind, item.path) == (DRIVES, folder)
+    assert item.size > 5000
+    item.remove()
     assert {path.name for path in folder.rglob("*") if path.is_file()} == {"notes.txt", "0.jpg"}
 
 
@@ -465,10 +467,10 @@ def test_a_changed_file_is_read_and_told_of_once(written, caplog):
     written.write_text(written.read_text() + "\n")
     for _ in range(2):
         read_geojson(written)
-    (told,) = caplog.records
-    assert told.levelno == logging.WARNING
-    assert str(written) in told.getMessage()
-    assert "has changed since we wrote it" in told.getMessage()
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert str(written) in record.getMessage()
+    assert "has changed since we wrote it" in record.getMessage()
 
 
 def test_a_damaged_list_says_nothing(written, caplog):

@@ -16,7 +16,7 @@ def test_what_was_put_is_read_listed_and_removed(memory, tmp_path):
     memory.write("a", b"x")
     memory.write("a", b"xy")
     assert memory.read("a") == b"xy"
-    assert {name: one.size for name, one in memory.listed().items()} == {"c/b": 5, "a": 2}
+    assert {name: listed.size for name, listed in memory.listed().items()} == {"c/b": 5, "a": 2}
     assert memory.below("c").read("b") == b"12345"
     memory.remove("a")
     memory.remove("a")
@@ -65,9 +65,9 @@ class Failing:
     ],
 )
 def test_what_fails_is_one_line(failure, says):
-    with pytest.raises(ConfigError, match=says) as told:
+    with pytest.raises(ConfigError, match=says) as caught:
         RemoteFolder(Failing(failure), "b", "s3://b", "output=").read("a")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

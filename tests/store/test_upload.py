@@ -43,7 +43,7 @@ def test_what_is_not_ours_is_neither_replaced_nor_removed(memory):
     put(memory, map=b"1")
     memory.write("run/notes", b"mine")
     put(memory, map=b"2")
-    with pytest.raises(ConfigError, match="run/notes: is no object of ours"):
+    with pytest.raises(ConfigError, match="run/notes: was not written by V2HDM"):
         put(memory, map=b"3", notes=b"ours")
     assert there(memory) == {"map": b"2", "notes": b"mine"}
 
@@ -99,10 +99,10 @@ def test_an_upload_that_stopped_anywhere_is_no_result_and_is_done_again(calls, m
     new = {"map": b"4", "log": b"5", "own": b"6"}
     with suppress(Stop):
         upload(stopping(memory, calls), new, "us", quiet)
-    kept = {"map": b"1", "log": b"2", "old": b"3"}
+    old_files = {"map": b"1", "log": b"2", "old": b"3"}
     whole = is_whole_at(memory.below("run"))
-    found = {name: data for name, data in there(memory).items() if name != UNFINISHED}
-    assert not whole or found in (kept, new)
+    files = {name: data for name, data in there(memory).items() if name != UNFINISHED}
+    assert not whole or files in (old_files, new)
     assert whole == (calls < 2 or calls > 8)
     assert put(memory, **new)
     assert there(memory) == new
@@ -140,7 +140,7 @@ def test_what_others_put_there_during_an_upload_is_not_replaced(memory):
         if done == 1:
             memory.write("run/log", b"mine")
 
-    with pytest.raises(ConfigError, match="run/log: is no object of ours"):
+    with pytest.raises(ConfigError, match="run/log: was not written by V2HDM"):
         upload(memory.below("run"), {"map": b"1", "log": b"2"}, "us", meanwhile)
     assert there(memory)["log"] == b"mine"
 

@@ -110,12 +110,12 @@ def test_a_moved_pixel_is_the_plane_s_where_the_ground_s_point_is_projected():
 
 
 def test_a_vehicle_that_stands_backs_up_or_comes_again_keeps_its_left():
-    there = arc()
+    way = arc()
     rng = np.random.default_rng(3)
-    waits = there[[19] * 15]
+    waits = way[[19] * 15]
     waits[:, :2, 3] += rng.normal(0.0, 0.01, (15, 2))
-    poses = np.concatenate([there[:20], waits, there[19:5:-1], there[5:], there])
-    session = np.repeat([0, 1], [len(poses) - len(there), len(there)])
+    poses = np.concatenate([way[:20], waits, way[19:5:-1], way[5:], way])
+    session = np.repeat([0, 1], [len(poses) - len(way), len(way)])
     paths = Paths.of(poses, session)
     frame = rng.integers(0, len(poses), 300)
     off = rng.uniform(-6, 6, 300)
@@ -138,33 +138,36 @@ def test_a_pixel_of_any_surface_is_moved_to_where_the_plane_would_show_its_place
     on_plane = np.array([
         surface.on_plane(p[None], cam, f)[0] for p, cam, f in zip(points, cam_from_map, frame, strict=True)
     ])  # fmt: skip
-    seen, plane = (projected(cam_from_map, at, 0 * height) for at in (on_plane, points))
-    moved = surface.flattened_px(intrinsic, cam_from_map, frame, seen)
-    known = height < 0.85  # half as high as the camera; what is higher stays where it is
+    seen_px, plane = (projected(cam_from_map, at, 0 * height) for at in (on_plane, points))
+    moved = surface.flattened_px(intrinsic, cam_from_map, frame, seen_px)
+    is_low = height < 0.85  # half as high as the camera; what is higher stays where it is
     # Behind a ridge a ray meets the ground before it gets there.
-    assert np.quantile(np.abs(moved - plane)[known].max(axis=1), 0.95) < 1e-5
+    assert np.quantile(np.abs(moved - plane)[is_low].max(axis=1), 0.95) < 1e-5
     columns = surface.seen_columns(points, frame)
     np.testing.assert_allclose(columns @ surface.parameters, height, atol=1e-12)
 
 
 def test_a_surface_read_back_shows_from_any_pose_what_the_plane_would(tmp_path):
-    there, rng = arc(), np.random.default_rng(8)
+    way, rng = arc(), np.random.default_rng(8)
     # The way back on the same road: each place was passed in two directions.
-    back = there[::-1] @ np.diag([-1.0, -1.0, 1.0, 1.0])
-    paths = Paths.of(np.concatenate([there, back]), np.repeat([0, 1], len(there)))
+    back = way[::-1] @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    paths = Paths.of(np.concatenate([way, back]), np.repeat([0, 1], len(way)))
     flat = Surface.level(paths)
     surface = replace(flat, parameters=rng.normal(0.0, 0.01, len(flat.parameters)), datum_m=80.0)
     write_json(tmp_path / "ground.json", surface.stored())
-    between = there.copy()  # poses that the surface was not made at
-    between[:, :2, 3] += 0.3 * there[:, :2, 0]
+    between = way.copy()  # poses that the surface was not made at
+    between[:, :2, 3] += 0.3 * way[:, :2, 0]
     read = Surface.from_stored(load_json(tmp_path / "ground.json", MapFileError), between)
     cam_from_map, frame, points = seen_from(between, rng, count=60)
-    seen = np.array([
+    points_map = np.array([
         read.on_plane(p[None], cam, f)[0] for p, cam, f in zip(points, cam_from_map, frame, strict=True)
     ])  # fmt: skip
     height = read.seen_height_m(points, frame)
     assert np.std(height) > 0.03
-    pixels, intrinsic = projected(cam_from_map, seen, 0 * height), np.tile(INTRINSIC, (len(frame), 1, 1))
+    pixels, intrinsic = (
+        projected(cam_from_map, points_map, 0 * height),
+        np.tile(INTRINSIC, (len(frame), 1, 1)),
+    )
     flat = read.flattened_px(intrinsic, cam_from_map, frame, pixels)
     np.testing.assert_allclose(flat, projected(cam_from_map, points, 0 * height), atol=1e-4)
 
@@ -233,9 +236,9 @@ def test_heights_are_estimated_with_their_sigmas_and_a_plane_is_none_the_better_
     rear, front = (np.add(left, right)) / 2
     slope = np.column_stack([(front - rear) / 2.8, np.subtract(left, right).mean(axis=0) / 1.6])
     # Receivers err alike over a while.
-    apart = np.abs(line[:, :1] - line[:, 0])
+    distances_m = np.abs(line[:, :1] - line[:, 0])
     long, short = (
-        np.linalg.cholesky(np.exp(-apart / over_m) + 1e-9 * np.eye(200)) for over_m in (30.0, 10.0)
+        np.linalg.cholesky(np.exp(-distances_m / over_m) + 1e-9 * np.eye(200)) for over_m in (30.0, 10.0)
     )
     height = rear + 0.015 * long @ rng.normal(size=200)
     road = Road(line, height, slope + 0.004 * short @ rng.normal(size=(200, 2)))
@@ -243,12 +246,12 @@ def test_heights_are_estimated_with_their_sigmas_and_a_plane_is_none_the_better_
     points = line[frame] + np.column_stack([rng.uniform(2, 15, 3000), rng.uniform(-8, 8, 3000)])
     flat = Surface.level(way(poses))
     plane = rear[frame] + np.einsum("ki,ki->k", slope[frame], points - line[frame])
-    seen = ground(points) - plane + rng.normal(0.0, sigma_m, 3000)
+    measured_m = ground(points) - plane + rng.normal(0.0, sigma_m, 3000)
     columns = flat.seen_columns(points, frame)
     noise = PoseNoise(position_m=0.01, position_drift_m=0.01, position_drift_over_m=30.0)
-    information, score = (columns.T @ columns).toarray() / sigma_m**2, -columns.T @ seen / sigma_m**2
-    found, gain = flat.estimated(information, score, Recorded.of(road, noise))
-    height, stated = found.height_m(points)
+    information, score = (columns.T @ columns).toarray() / sigma_m**2, -columns.T @ measured_m / sigma_m**2
+    surface, gain = flat.estimated(information, score, Recorded.of(road, noise))
+    height, stated = surface.height_m(points)
     off = height - ground(points)
     # No image shows the height, grade and bank of the whole, which err as the receiver does.
     whole = np.column_stack([np.ones(3000), points])
@@ -287,20 +290,22 @@ def test_a_map_over_a_plane_gets_no_file_of_its_ground_and_is_told_so(tmp_path, 
 @pytest.mark.parametrize("engine", ["native", "torch"])
 def test_a_step_of_heights_is_that_to_the_least_cost_of_everything_anew(engine):
     scene = make_scene(3, frames=40, start_error_deg=0.1, start_error_m=0.01)
-    options, seen = SolveOptions(loss="none", engine=engine, coarse=False), scene.problem.observations
-    corners = scene.corners_map[seen.corner]
-    away = corners - scene.map_from_vehicle[seen.frame][:, :2, 3]
-    heights = -0.5 * np.abs(np.sum(away * scene.map_from_vehicle[seen.frame][:, :2, 1], axis=1))
-    pose = scene.cam_from_vehicle[seen.camera] @ np.linalg.inv(scene.map_from_vehicle[seen.frame])
-    camera = scene.problem.intrinsic[seen.camera]
+    options, observations = SolveOptions(loss="none", engine=engine, coarse=False), scene.problem.observations
+    corners = scene.corners_map[observations.corner]
+    away = corners - scene.map_from_vehicle[observations.frame][:, :2, 3]
+    heights = -0.5 * np.abs(np.sum(away * scene.map_from_vehicle[observations.frame][:, :2, 1], axis=1))
+    pose = scene.cam_from_vehicle[observations.camera] @ np.linalg.inv(
+        scene.map_from_vehicle[observations.frame]
+    )
+    camera = scene.problem.intrinsic[observations.camera]
 
     def pixels(z):
         cam = np.einsum("kij,kj->ki", pose, np.column_stack([corners, z, np.ones(len(z))]))[:, :3]
         return camera[:, :2] * cam[:, :2] / cam[:, 2:] + camera[:, 2:]
 
     def cost(share):
-        moved = seen.pinhole_px - pixels(share * heights) + pixels(0 * heights)
-        return solve(replace(scene.problem, observations=replace(seen, pinhole_px=moved)), options)
+        moved = observations.pinhole_px - pixels(share * heights) + pixels(0 * heights)
+        return solve(replace(scene.problem, observations=replace(observations, pinhole_px=moved)), options)
 
     low, middle, high = (cost(share) for share in (-0.01, 0.0, 0.01))
     slope, bend = (high.cost - low.cost) / 0.02, (high.cost - 2 * middle.cost + low.cost) / 1e-4
@@ -345,14 +350,14 @@ def test_a_plane_stays_one_to_the_last_bit(plane):
 
 def test_a_port_rendered_on_a_grade_with_a_crown_is_mapped_as_well_as_the_flat_one(rendered):
     lenses = {"width": 640, "height": 360, "focal_px": 450.0}
-    cameras = {name: replace(one, **lenses) for name, one in PortConfig().cameras.items()}
+    cameras = {name: replace(camera, **lenses) for name, camera in PortConfig().cameras.items()}
     port = small_port(relief=ReliefConfig(grade=0.05, crown=0.03), cameras=cameras)
     drive = read_drive(rendered(replace(port, route=replace(port.route, image_spacing_m=1.5))))
     detections = detect_all(drive, DetectorOptions.for_mapping())
-    found = run_methods(drive, detections, tuple(cameras))["Opt"]
+    optimum = run_methods(drive, detections, tuple(cameras))["Opt"]
     truth = read_truth(drive)
-    figures = map_figures(found.hd_map, truth, driven_past(drive, truth, tuple(cameras)))
-    assert found.surface is not None
+    figures = map_figures(optimum.hd_map, truth, driven_past(drive, truth, tuple(cameras)))
+    assert optimum.surface is not None
     assert (figures["recall"], figures["false_markings"]) == (1.0, 0)
     assert figures["corner_rmse_m"] < 1.2 * 0.0211  # of the flat one; the plane is 17 cm off
     assert figures["height_rmse_m"] < 0.02

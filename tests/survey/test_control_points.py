@@ -77,9 +77,9 @@ def adjusted(scene, survey, one_by_one=False):
 
 def mean_offset_m(corners_map, truth):
     """How far the corners as a whole are off those of the truth that are nearest to them."""
-    apart = np.linalg.norm(corners_map[:, None] - truth[None], axis=-1)
-    off = corners_map - truth[apart.argmin(axis=1)]
-    return float(np.linalg.norm(np.median(off[apart.min(axis=1) < 0.2], axis=0)))
+    distances_m = np.linalg.norm(corners_map[:, None] - truth[None], axis=-1)
+    off = corners_map - truth[distances_m.argmin(axis=1)]
+    return float(np.linalg.norm(np.median(off[distances_m.min(axis=1) < 0.2], axis=0)))
 
 
 def test_two_surveyed_corners_take_the_drift_of_the_receiver_out_of_the_map():
@@ -104,8 +104,8 @@ def test_two_surveyed_corners_take_the_drift_of_the_receiver_out_of_the_map():
 
 
 def test_a_control_point_has_its_own_sigmas_and_is_left_out_by_name():
-    one = named("A", position_map=[1.0, 0.0], sigma_m=[0.002, 0.05])
-    survey = SurveyOptions(points=[named("B", position_map=[0.0, 0.02]), one])
+    point_a = named("A", position_map=[1.0, 0.0], sigma_m=[0.002, 0.05])
+    survey = SurveyOptions(points=[named("B", position_map=[0.0, 0.02]), point_a])
     control = control_points(survey, SQUARE[None], INDEX, PoseSigma())
     assert dict(zip(control.corner.tolist(), control.sigma_m.tolist(), strict=True)) == {
         7: [0.01, 0.01],
@@ -121,7 +121,9 @@ def test_points_find_their_corners_in_a_map_that_drifts_by_more_than_half_a_dash
     )
     index = np.arange(20).reshape(5, 4)
     points = dashes[np.arange(5), [0, 2, 3, 1, 0]] - [0.03, 0.08]
-    survey = SurveyOptions(points=[named(f"P{k}", position_map=one.tolist()) for k, one in enumerate(points)])
+    survey = SurveyOptions(
+        points=[named(f"P{k}", position_map=place.tolist()) for k, place in enumerate(points)]
+    )
     drifting = PoseSigma(0.08, position_drift=Drift(0.079, 100.0))
     control = control_points(survey, dashes, index, drifting)
     assert set(control.corner.tolist()) == {0, 6, 11, 13, 16}
@@ -141,13 +143,13 @@ def test_the_errors_of_a_maps_corners_hang_together_as_drift_makes_them():
     joint = result.joint_covariance(chosen, chosen % 4)
     assert np.linalg.eigvalsh(joint).min() > -1e-12
     for k, marking in enumerate(markings):
-        own = marking.covariance_m2.reshape(4, 2, 4, 2)[k % 4, :, k % 4]
-        np.testing.assert_allclose(joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2], own, atol=5e-6)
+        of_corner = marking.covariance_m2.reshape(4, 2, 4, 2)[k % 4, :, k % 4]
+        np.testing.assert_allclose(joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2], of_corner, atol=5e-6)
     sigma_m = np.sqrt(np.diag(joint))
     alike = (joint / np.outer(sigma_m, sigma_m))[0::2, 0::2]
     assert alike.min() > 0.8
-    both = result.joint_covariance(np.array([3, 3]), np.array([0, 2]))
-    np.testing.assert_allclose(both[:2, 2:], markings[3].covariance_m2.reshape(4, 2, 4, 2)[0, :, 2])  # type: ignore[union-attr]
+    of_pair = result.joint_covariance(np.array([3, 3]), np.array([0, 2]))
+    np.testing.assert_allclose(of_pair[:2, 2:], markings[3].covariance_m2.reshape(4, 2, 4, 2)[0, :, 2])  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
@@ -175,9 +177,9 @@ def test_the_errors_of_a_maps_corners_hang_together_as_drift_makes_them():
 )
 def test_options_that_cannot_be_used_are_refused(options, message):
     parts = {"survey": SurveyOptions, "known_sizes": SizeOptions, "lanes": LaneOptions}
-    given = {key: parts[key](**value) if key in parts else value for key, value in options.items()}
+    mapping_options = {key: parts[key](**value) if key in parts else value for key, value in options.items()}
     with pytest.raises(ConfigError, match=message):
-        check_options(MappingOptions(**given), CORNERED_CLASSES)
+        check_options(MappingOptions(**mapping_options), CORNERED_CLASSES)
 
 
 def test_a_survey_that_is_still_a_file_is_refused(scene):
@@ -192,20 +194,20 @@ STRIP = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 0.15], [0.0, 0.15]])
 
 def lengths_of(kind, corners):
     index = np.arange(100, 104)[None]
-    found = known_lengths(SIZES, [kind], corners[None], index)
-    if found is None:
+    known = known_lengths(SIZES, [kind], corners[None], index)
+    if known is None:
         return {}
-    ends = np.sort(np.stack([found.first, found.second]), axis=0).T - 100
-    return {(int(a), int(b)): float(m) for (a, b), m in zip(ends, found.length_m, strict=True)}
+    ends = np.sort(np.stack([known.first, known.second]), axis=0).T - 100
+    return {(int(a), int(b)): float(m) for (a, b), m in zip(ends, known.length_m, strict=True)}
 
 
 @given(turn=st.integers(0, 3), off=st.floats(-0.1, 0.1))
 def test_whichever_corner_comes_first_the_distances_are_those_of_the_marking(turn, off):
     for kind, shape, pairs in ((DIAMOND, RHOMBUS, 2), (LANE_DASH, STRIP, 4)):
         corners = np.roll(shape, turn, axis=0)
-        found = lengths_of(kind, (1 + off) * corners)
-        assert len(found) == pairs
-        for (a, b), metres in found.items():
+        metres_of = lengths_of(kind, (1 + off) * corners)
+        assert len(metres_of) == pairs
+        for (a, b), metres in metres_of.items():
             assert metres == pytest.approx(np.linalg.norm(corners[a] - corners[b]))
 
 
@@ -226,9 +228,9 @@ def test_a_map_that_grows_marking_by_marking_keeps_to_the_sizes():
     solved = Optimiser(sightings, views, scene.drive.cameras, (noise,), options).grow()
     assert solved.problem.lengths is not None
     long_m = np.array([_diagonals(c)[0] for c in solved.corners_map if np.isfinite(c).all()])
-    near = long_m[np.abs(long_m - true[0]) < 0.15 * true[0]]
-    assert len(near) > 5
-    assert np.std(near) < 0.004
+    lengths_m = long_m[np.abs(long_m - true[0]) < 0.15 * true[0]]
+    assert len(lengths_m) > 5
+    assert np.std(lengths_m) < 0.004
 
 
 def _diagonals(corners):
@@ -248,7 +250,7 @@ def mapped(scene, drive, options=OPTIONS):
 
 
 def faults(result):
-    return [one.fault for one in result.evidence.corrected]
+    return [test.fault for test in result.evidence.corrected]
 
 
 def centre_of(result):
@@ -266,9 +268,9 @@ def surveyed(drive, off_m):
 def test_a_survey_half_a_metre_too_high_is_dropped_and_told(scene):
     result = mapped(scene, surveyed(scene.drive, (0.0, 0.0, 0.5)))
     assert faults(result) == [table.SURVEY]
-    (told,) = result.evidence.corrected
-    assert (told.cameras, told.axis) == (("front",), 2)
-    assert told.value == pytest.approx(-0.5, abs=0.1)
+    (dropped,) = result.evidence.corrected
+    assert (dropped.cameras, dropped.axis) == (("front",), 2)
+    assert dropped.value == pytest.approx(-0.5, abs=0.1)
     assert centre_of(result)[2] == pytest.approx(2.4, abs=0.05)
 
 
@@ -282,7 +284,7 @@ def test_positions_in_web_mercator_are_reported_and_no_survey_is_dropped_for_the
         images.append(replace(image, map_from_vehicle=pose))
     result = mapped(street, replace(street.drive, images=images))
     assert faults(result) == []
-    assert table.SCALE in [one.fault for one in result.evidence.score_tests if is_contradicted(one)]
+    assert table.SCALE in [test.fault for test in result.evidence.score_tests if is_contradicted(test)]
 
 
 def test_known_sizes_that_the_paint_does_not_have_are_dropped_and_told(scene):
@@ -295,12 +297,12 @@ def test_known_sizes_that_the_paint_does_not_have_are_dropped_and_told(scene):
 
 
 def test_a_surveyed_point_that_lies_elsewhere_is_dropped_and_one_far_from_the_map_warned_of(scene, caplog):
-    known = mapped(scene, scene.drive).hd_map.markings
-    points = [m.corners_map[0] for m in known[2:14:3]]
+    markings = mapped(scene, scene.drive).hd_map.markings
+    points = [m.corners_map[0] for m in markings[2:14:3]]
     points[1] = points[1] + (0.15, 0.0)
     survey = survey_of(*points, (500.0, 3.0), sigma_m=0.005)
     result = mapped(scene, scene.drive, replace(OPTIONS, survey=survey))
-    assert [one.about for one in result.evidence.corrected] == [f"({points[1][0]:.2f}, {points[1][1]:.2f})"]
+    assert [test.about for test in result.evidence.corrected] == [f"({points[1][0]:.2f}, {points[1][1]:.2f})"]
     assert re.search(r"1 of [45] surveyed points are not used.*\(500\.00, 3\.00\)", caplog.text)
 
 
@@ -340,4 +342,4 @@ def test_inputs_are_tested_with_the_poses_estimated_even_where_the_first_groups_
 def test_right_inputs_are_kept(scene, sizes):
     result = mapped(scene, scene.drive, replace(OPTIONS, known_sizes=sizes))
     assert faults(result) == []
-    assert max(one.sigmas for one in result.evidence.score_tests) < 5
+    assert max(test.sigmas for test in result.evidence.score_tests) < 5

@@ -57,9 +57,9 @@ def test_local_points_keep_their_metres_names_roles_and_sigmas(tmp_path):
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:32631"])
 def test_grid_coordinates_of_any_zone_lie_where_they_are_whatever_its_convergence(crs, tmp_path):
-    found = points(tmp_path, written("Easting,Northing,height", stated_in(crs)), ORIGIN, crs=crs)
-    np.testing.assert_allclose([one.position_map for one in found], PLACES[:, :2], atol=1e-4)
-    np.testing.assert_allclose([one.height_m for one in found], PLACES[:, 2], atol=1e-4)
+    read_points = points(tmp_path, written("Easting,Northing,height", stated_in(crs)), ORIGIN, crs=crs)
+    np.testing.assert_allclose([point.position_map for point in read_points], PLACES[:, :2], atol=1e-4)
+    np.testing.assert_allclose([point.height_m for point in read_points], PLACES[:, 2], atol=1e-4)
 
 
 def test_grid_coordinates_and_heights_of_a_grid_of_feet_are_in_feet(tmp_path):
@@ -79,25 +79,27 @@ def test_grid_coordinates_and_heights_of_a_grid_of_feet_are_in_feet(tmp_path):
 
 def test_latitudes_and_longitudes_lie_where_they_are(tmp_path):
     geodetic = geodetic_from_enu(ORIGIN, PLACES)
-    found = points(tmp_path, written("lat,lon,altitude_m", geodetic), ORIGIN)
-    np.testing.assert_allclose([one.position_map for one in found], PLACES[:, :2], atol=1e-3)
-    np.testing.assert_allclose([one.height_m for one in found], PLACES[:, 2], atol=1e-3)
+    read_points = points(tmp_path, written("lat,lon,altitude_m", geodetic), ORIGIN)
+    np.testing.assert_allclose([point.position_map for point in read_points], PLACES[:, :2], atol=1e-3)
+    np.testing.assert_allclose([point.height_m for point in read_points], PLACES[:, 2], atol=1e-3)
 
 
 def test_a_point_without_a_height_is_at_that_of_the_origin(tmp_path):
-    found = points(tmp_path, written("east,north", stated_in("EPSG:32632")[:, :2]), ORIGIN, crs="EPSG:32632")
-    np.testing.assert_allclose([one.position_map for one in found], PLACES[:, :2], atol=1e-3)
-    assert [one.height_m for one in found] == [None] * 3
+    read_points = points(
+        tmp_path, written("east,north", stated_in("EPSG:32632")[:, :2]), ORIGIN, crs="EPSG:32632"
+    )
+    np.testing.assert_allclose([point.position_map for point in read_points], PLACES[:, :2], atol=1e-3)
+    assert [point.height_m for point in read_points] == [None] * 3
 
 
 def test_heights_above_the_sea_need_the_geoid_and_are_not_used_without(tmp_path, caplog):
     crs = "EPSG:32632+5773"
     text = written("east,north,height_m", stated_in("EPSG:32632", geoid_m=39.6))
-    assert [one.height_m for one in points(tmp_path, text, ORIGIN, crs=crs)] == [None] * 3
+    assert [point.height_m for point in points(tmp_path, text, ORIGIN, crs=crs)] == [None] * 3
     assert "geoid_m" in caplog.text
-    found = points(tmp_path, text, ORIGIN, crs=crs, geoid_m=39.6)
-    np.testing.assert_allclose([one.height_m for one in found], PLACES[:, 2], atol=1e-3)
-    np.testing.assert_allclose([one.position_map for one in found], PLACES[:, :2], atol=1e-3)
+    read_points = points(tmp_path, text, ORIGIN, crs=crs, geoid_m=39.6)
+    np.testing.assert_allclose([point.height_m for point in read_points], PLACES[:, 2], atol=1e-3)
+    np.testing.assert_allclose([point.position_map for point in read_points], PLACES[:, :2], atol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -34,10 +34,10 @@ def answers_to(questions, answer, subject):
 
 @pytest.mark.parametrize(("answer", "ways"), [("along", {1}), ("against", {-1}), ("both", {1, -1})])
 def test_a_lane_is_driven_as_stated_along_or_against_the_line_of_its_question(answer, ways):
-    asked = lane_graph(street(), [eastward()]).questions
-    (question,) = [question for question in asked if question.subject == "direction"]
+    questions = lane_graph(street(), [eastward()]).questions
+    (question,) = [question for question in questions if question.subject == "direction"]
     way = question.to_map - question.place_map
-    graph = lane_graph(street(), [eastward()], answers_to(asked, answer, "direction"))
+    graph = lane_graph(street(), [eastward()], answers_to(questions, answer, "direction"))
     lanes = [lane for lane in graph.lanes if lane.centre_map[:, 1].mean() > 3.5]
     assert {int(np.sign((lane.centre_map[-1] - lane.centre_map[0]) @ way)) for lane in lanes} == ways
     assert {lane.direction for lane in lanes} == {Direction.STATED}
@@ -52,14 +52,14 @@ def test_a_direction_that_contradicts_a_drive_is_one_line():
         MapFileError, match=r"feature 4: a drive went the other way .* \(30.0, 1.8\); answer both"
     ):
         lane_graph(street(), [eastward()], [west])
-    both = Answer("direction", "both", west.place_map, west.to_map, west.where)
-    assert len([lane for lane in lane_graph(street(), [eastward()], [both]).lanes if lane.drives]) == 1
+    both_ways = Answer("direction", "both", west.place_map, west.to_map, west.where)
+    assert len([lane for lane in lane_graph(street(), [eastward()], [both_ways]).lanes if lane.drives]) == 1
 
 
 def test_a_turn_that_is_allowed_becomes_a_way_as_round_as_an_arc():
     site = made_site()
-    asked = lane_graph(site.hd_map, site.trajectories).questions
-    answers = answers_to(asked, "yes", "connection")
+    questions = lane_graph(site.hd_map, site.trajectories).questions
+    answers = answers_to(questions, "yes", "connection")
     graph = lane_graph(site.hd_map, site.trajectories, answers)
     more = {(ENDS[before], ENDS[after]) for before, after in UNDRIVEN}
     assert matched(ways_of(graph), WAYS | more) == WAYS | more
@@ -75,27 +75,27 @@ def test_a_turn_that_is_allowed_becomes_a_way_as_round_as_an_arc():
 
 def test_a_turn_that_is_not_allowed_is_asked_no_more():
     site = made_site()
-    asked = lane_graph(site.hd_map, site.trajectories).questions
-    graph = lane_graph(site.hd_map, site.trajectories, answers_to(asked, "no", "connection"))
+    questions = lane_graph(site.hd_map, site.trajectories).questions
+    graph = lane_graph(site.hd_map, site.trajectories, answers_to(questions, "no", "connection"))
     assert matched(ways_of(graph), WAYS) == WAYS
     assert {question.subject for question in graph.questions} == {"speed", "right of way"}
 
 
 def test_a_stated_speed_is_that_of_all_lanes():
-    asked = lane_graph(street(), [eastward()]).questions
-    graph = lane_graph(street(), [eastward()], answers_to(asked, "30", "speed"))
+    questions = lane_graph(street(), [eastward()]).questions
+    graph = lane_graph(street(), [eastward()], answers_to(questions, "30", "speed"))
     assert {lane.speed_kmh for lane in graph.lanes} == {30.0}
 
 
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (("direction", "left", (30, 5), (35, 5)), "'left' is no direction"),
+        (("direction", "left", (30, 5), (35, 5)), "'left' is not a direction"),
         (("direction", "along", (30, 50), (35, 50)), r"no lane lies at \(30.0, 50.0\)"),
         (("connection", "yes", (30, 5), (35, 5)), r"no lane ends at \(30.0, 5.0\)"),
         (("connection", "yes", (30, 5), None), "it has one place"),
-        (("speed", "quick", (0, 0), None), "'quick' is no speed"),
-        (("speed", "-3", (0, 0), None), "'-3' is no speed"),
+        (("speed", "quick", (0, 0), None), "'quick' is not a speed"),
+        (("speed", "-3", (0, 0), None), "'-3' is not a speed"),
     ],
 )
 def test_an_answer_that_cannot_be_followed_is_one_line(answer, message):

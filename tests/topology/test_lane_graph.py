@@ -41,10 +41,10 @@ def test_every_lane_and_way_of_the_site_is_found_and_none_other(seed):
 
 def test_what_no_drive_took_is_asked_and_nothing_else():
     graph = graph_of(made_site())
-    asked = [question for question in graph.questions if question.subject == "connection"]
-    places = [(question.place_map, question.to_map) for question in asked]
+    questions = [question for question in graph.questions if question.subject == "connection"]
+    places = [(question.place_map, question.to_map) for question in questions]
     truth = {(ENDS[before], ENDS[after]) for before, after in UNDRIVEN}
-    assert len(asked) == len(truth)
+    assert len(questions) == len(truth)
     assert matched(places, truth) == truth
     assert {question.subject for question in graph.questions} == {"connection", "speed", "right of way"}
 
@@ -55,12 +55,12 @@ def test_a_turn_that_only_one_drive_took_is_asked_without_it():
     graph = graph_of(made_site(drives=(0, 1, 2, 3, 5, 6, 7, 8, 9)))
     way = (ENDS["west in"], ENDS["north out"])
     assert matched(ways_of(graph), WAYS) == WAYS - {way}
-    asked = [
+    questions = [
         (question.place_map, question.to_map)
         for question in graph.questions
         if question.subject == "connection"
     ]
-    assert way in matched(asked, {way})
+    assert way in matched(questions, {way})
 
 
 def test_ways_turn_as_the_drives_did_and_splits_do_not_turn():
@@ -136,11 +136,11 @@ def test_a_lane_driven_both_ways_is_two_lanes_and_asked():
 
 
 def test_a_vehicle_that_reverses_does_not_drive_its_lane_that_way():
-    there = driven([(0, 1.75), (60, 1.75)])
-    back = Trajectory(there.stamp_s, there.map_from_vehicle[::-1])  # the vehicle still looks east
+    eastward = driven([(0, 1.75), (60, 1.75)])
+    back = Trajectory(eastward.stamp_s, eastward.map_from_vehicle[::-1])  # the vehicle still looks east
     (lane,) = lane_graph(one_lane(), [back]).lanes
     assert lane.direction is Direction.ASKED
-    (lane,) = lane_graph(one_lane(), [there, back]).lanes
+    (lane,) = lane_graph(one_lane(), [eastward, back]).lanes
     assert lane.drives == (0,)
 
 

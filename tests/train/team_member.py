@@ -19,9 +19,9 @@ def small(output: Path, steps: int) -> TrainConfig:
 
 
 def main(folder: Path) -> None:
-    seen: list[int] = []
+    indices: list[int] = []
     render = RenderStream._render
-    RenderStream._render = lambda self, index: (seen.append(index), render(self, index))[1]
+    RenderStream._render = lambda self, index: (indices.append(index), render(self, index))[1]
     with joined_team("cpu") as team:
         mean = torch.tensor([float(team.rank), 10.0 * team.rank])
         team.average([mean[:1], mean[1:]])
@@ -30,7 +30,7 @@ def main(folder: Path) -> None:
             left = trainer.state.step
             state = trainer.run()
         members = {"net": trainer.net.state_dict(), "averaged": trainer.averaged.module.state_dict()}
-        plain = {"left": left, "step": state.step, "renders": state.renders, "seen": seen, "mean": mean}
+        plain = {"left": left, "step": state.step, "renders": state.renders, "seen": indices, "mean": mean}
         torch.save(members | plain, folder / f"member{team.rank}.pt")
 
 

@@ -112,10 +112,10 @@ def test_all_else_that_the_network_says_stays(config, start):
     before = load_checkpoint(start).network()
     image = torch.randint(0, 256, (1, 64, 96, 3), dtype=torch.uint8)
     with torch.inference_mode():
-        said, known = after(image), before(image)
-    assert torch.equal(said.paint, known.paint)
-    assert torch.equal(said.lanes, known.lanes)
-    torch.testing.assert_close(said.kinds[:, : len(KNOWN)], known.kinds)
+        said, said_before = after(image), before(image)
+    assert torch.equal(said.paint, said_before.paint)
+    assert torch.equal(said.lanes, said_before.lanes)
+    torch.testing.assert_close(said.kinds[:, : len(KNOWN)], said_before.kinds)
 
 
 @pytest.mark.slow
@@ -211,8 +211,8 @@ def test_a_render_is_open_where_paint_has_no_class():
 
 def test_a_mirrored_view_is_the_mirror_of_a_plain_one(config, monkeypatch):
     (image,) = (image for image in labelled_images(config.data) if image.shapes)
-    asked = [Change(1.0, is_mirrored=mirrored, is_relit=False) for mirrored in (False, True)]
-    monkeypatch.setattr("train.areas.views.changes", lambda *_: iter(asked))
+    views = [Change(1.0, is_mirrored=mirrored, is_relit=False) for mirrored in (False, True)]
+    monkeypatch.setattr("train.areas.views.changes", lambda *_: iter(views))
     plain, mirrored = views_of_photograph(image, AREAS, 0.25, np.random.default_rng(0))
     assert plain.image.shape == (48, WIDTH, 3), "a quarter of the height is sky"
     np.testing.assert_array_equal(plain.image[:, ::-1], mirrored.image)

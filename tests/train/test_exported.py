@@ -303,8 +303,8 @@ def test_a_label_is_called_like_an_own_class(tmp_path):
     data = labels_of(tmp_path, "Parking-T")
     images = read_labels(data, CLASSES)
     rng = np.random.default_rng(0)
-    seen = torch.cat([images.view(rng)[1].kinds.flatten() for _ in range(30)])
-    assert set(seen.tolist()) == {CLASSES.index(T), IGNORE}
+    classes = torch.cat([images.view(rng)[1].kinds.flatten() for _ in range(30)])
+    assert set(classes.tolist()) == {CLASSES.index(T), IGNORE}
     with pytest.raises(LabelError, match="'Parking-T' is no class of the detector"):
         read_labels(data)
     (shape,) = images.images[0].shapes or ()
@@ -390,7 +390,7 @@ def test_a_checkpoint_of_before_there_were_own_classes_is_read(tmp_path, shipped
 
 
 @pytest.mark.parametrize(
-    ("own", "words"),
+    ("own_classes", "words"),
     [
         ({PAD: {"family": "circle"}}, "family of 'pad'"),
         ({"diamond": ENTRIES[PAD]}, "is already the name of 'diamond'"),
@@ -398,11 +398,11 @@ def test_a_checkpoint_of_before_there_were_own_classes_is_read(tmp_path, shipped
         ({T: ENTRIES[T]}, r"unknown classes \['pad'\]"),
     ],
 )
-def test_a_file_with_wrong_classes_is_refused(tmp_path, exported, own, words):
+def test_a_file_with_wrong_classes_is_refused(tmp_path, exported, own_classes, words):
     path = tmp_path / "own.onnx"
     model = onnx.load_model(str(exported))
     (entry,) = model.metadata_props
-    entry.value = json.dumps(json.loads(entry.value) | {"own_classes": own})
+    entry.value = json.dumps(json.loads(entry.value) | {"own_classes": own_classes})
     onnx.save_model(model, str(path))
     with pytest.raises(DetectorError, match=words):
         Network(path)

@@ -57,7 +57,7 @@ def detector():
 def reported(shown, detector, spots):
     with pytest.MonkeyPatch.context() as patch:
         run = detector.run_network
-        patch.setattr(detector, "run_network", lambda *given: spots.claimed(run(*given)))
+        patch.setattr(detector, "run_network", lambda *arguments: spots.claimed(run(*arguments)))
         markings, _ = detector.detect(shown.image, shown.camera)
     return [marking for marking in markings if len(marking.outline_px) == 0]
 
@@ -81,7 +81,7 @@ def test_spots_of_sun_are_proposed_as_markings_and_known_to_be_none(shown, detec
     assert (spots.light > 0).any()
     assert without.true.count(True) > 3
     lists = (without.kind, without.evidence, without.views, without.true, without.lit)
-    assert len({len(one) for one in lists}) == 1
+    assert len({len(values) for values in lists}) == 1
     assert all(with_spots.lit)
     assert with_spots.true.count(False) > without.true.count(False)
     plain = [m for m in detector.detect(shown.image, shown.camera)[0] if len(m.outline_px) == 0]
@@ -104,9 +104,9 @@ def test_spots_of_sun_that_the_network_takes_for_markings_are_not_reported(shown
 
 
 def test_lines_of_lanes_are_proposed_with_their_truth(shown, detector):
-    found = proposed(seen(shown, detector))
-    assert len(found.lines) == len(found.alone) == len(found.true)
-    assert found.true.any()
+    lane_lines = proposed(seen(shown, detector))
+    assert len(lane_lines.lines) == len(lane_lines.alone) == len(lane_lines.true)
+    assert lane_lines.true.any()
 
 
 def test_readings_that_were_gathered_in_parts_are_those_gathered_at_once(tmp_path):
@@ -120,9 +120,9 @@ def test_readings_that_were_gathered_in_parts_are_those_gathered_at_once(tmp_pat
     together = Gathered.load([part.path for part in parts[:2]])
     assert 0 < len(first.kind) < len(whole.kind) == len(first.kind) + len(second.kind)
     for item in fields(Gathered):
-        one, other = getattr(together, item.name), getattr(whole, item.name)
-        assert type(one[0]) is type(other[0])
-        np.testing.assert_array_equal(np.array(one), np.array(other), err_msg=item.name)
+        of_parts, other = getattr(together, item.name), getattr(whole, item.name)
+        assert type(of_parts[0]) is type(other[0])
+        np.testing.assert_array_equal(np.array(of_parts), np.array(other), err_msg=item.name)
     assert {type(true) for true in whole.true} <= {bool, type(None)}
 
 
@@ -131,7 +131,7 @@ def test_what_is_seen_of_lanes_comes_back_from_another_process():
     part = fit_lane_score.Part(range(3), 100, weights.NETWORK_FILE)
     with open_executor(1, isolated=True) as executor:
         executor.share_out(fit_lane_score.see, [part], cv2.setNumThreads, (1,), seen_there.extend)
-    lines = [found.lines for image in seen_there if (found := proposed(image)) is not None]
+    lines = [proposal.lines for image in seen_there if (proposal := proposed(image)) is not None]
     assert len(seen_there) == 3
     assert sum(map(len, lines)) > 0
 
@@ -159,9 +159,9 @@ def test_a_hollow_diamond_is_one_marking_as_worn_as_the_worst_of_its_strokes():
     whole = whole_ones([dash, *outlines[0], *outlines[1], filled])
     assert whole[0] is dash
     assert whole[3] is filled
-    for one, strokes in zip(whole[1:3], outlines, strict=True):
-        np.testing.assert_array_equal(one.polygon_map, strokes[0].polygon_map)
-        assert one.wear == max(stroke.wear for stroke in strokes[1:]) < 1
+    for diamond, strokes in zip(whole[1:3], outlines, strict=True):
+        np.testing.assert_array_equal(diamond.polygon_map, strokes[0].polygon_map)
+        assert diamond.wear == max(stroke.wear for stroke in strokes[1:]) < 1
 
 
 CONFIG = JudgeConfig(epochs=6, width=4)
@@ -184,56 +184,56 @@ def quadrilaterals(seed, count, noise=0.2):
 
 
 def test_what_shows_in_views_alone_is_learnt_and_a_seed_repeats_it():
-    known, unseen = quadrilaterals(1, 1200), quadrilaterals(2, 400)
-    odds, _ = judged(train_judge(known, CONFIG), unseen)
+    gathered, unseen = quadrilaterals(1, 1200), quadrilaterals(2, 400)
+    odds, _ = judged(train_judge(gathered, CONFIG), unseen)
     assert ((odds > 0) == unseen.true).mean() > 0.95
-    np.testing.assert_array_equal(odds, judged(train_judge(known, CONFIG), unseen)[0])
+    np.testing.assert_array_equal(odds, judged(train_judge(gathered, CONFIG), unseen)[0])
 
 
 def test_the_errors_of_sides_are_learnt_one_by_one():
     """The errors of top and bottom, which mirroring makes alike, are large; those of the ends are not."""
-    known = replace(quadrilaterals(7, 2000), true=np.ones(2000, dtype=bool))
-    _, sigma_px = judged(train_judge(known, replace(CONFIG, epochs=12)), known)
+    gathered = replace(quadrilaterals(7, 2000), true=np.ones(2000, dtype=bool))
+    _, sigma_px = judged(train_judge(gathered, replace(CONFIG, epochs=12)), gathered)
     typical = np.median(sigma_px, axis=0)
     assert typical[[0, 2]].min() > 3 * typical[[1, 3]].max()
 
 
 def test_where_the_paint_network_is_confident_the_image_has_a_say_of_its_own():
     """It claims what is true in training, and later that all are: then only the views can decide."""
-    known, unseen = (replace(quadrilaterals(seed, 1200, 0.5), claimed_features=(0,)) for seed in (5, 6))
-    for part, true in ((known, known.true), (unseen, True)):
+    gathered, unseen = (replace(quadrilaterals(seed, 1200, 0.5), claimed_features=(0,)) for seed in (5, 6))
+    for part, true in ((gathered, gathered.true), (unseen, True)):
         part.evidence[:, 0] = np.where(true, 2.0, -2.0)
-    told = {}
+    differences = {}
     for share in (0.0, 0.3):
-        odds, _ = judged(train_judge(known, replace(CONFIG, claimed_share=share, side_weight=0.0)), unseen)
-        told[share] = np.median(odds[unseen.true]) - np.median(odds[~unseen.true])
-    assert told[0.3] > told[0.0] + 0.5
+        odds, _ = judged(train_judge(gathered, replace(CONFIG, claimed_share=share, side_weight=0.0)), unseen)
+        differences[share] = np.median(odds[unseen.true]) - np.median(odds[~unseen.true])
+    assert differences[0.3] > differences[0.0] + 0.5
 
 
 def test_the_file_answers_as_the_network_does_for_any_number_of_rows_and_can_be_read_again(tmp_path):
-    known = quadrilaterals(3, 200)
-    judge = train_judge(known, CONFIG)
+    gathered = quadrilaterals(3, 200)
+    judge = train_judge(gathered, CONFIG)
     path = tmp_path / "judge.onnx"
     write_judge(judge, (3, 20, 20), {"features": ["a"]}, path)
     assert not onnx.load(path).graph.node[0].metadata_props
     session = onnxruntime.InferenceSession(path)
     for rows in (1, 33, 200):
-        part = known.take(np.arange(rows))
-        given = {"views": part.views, "evidence": part.evidence, "shape": part.shape}
-        odds, log_sigma = session.run(None, given)
+        part = gathered.take(np.arange(rows))
+        fields = {"views": part.views, "evidence": part.evidence, "shape": part.shape}
+        odds, log_sigma = session.run(None, fields)
         expected = judged(judge, part)
         np.testing.assert_allclose(odds, expected[0], atol=1e-4)
         np.testing.assert_allclose(np.exp(log_sigma), expected[1], rtol=1e-3)
     again = read_judge(path, 3, 4, 2, CONFIG.width)
     assert again is not None
-    for new, old in zip(judged(again.eval(), known), judged(judge, known), strict=True):
+    for new, old in zip(judged(again.eval(), gathered), judged(judge, gathered), strict=True):
         np.testing.assert_allclose(new, old, atol=1e-5)
     assert read_judge(path, 3, 5, 2, CONFIG.width) is None
 
 
 def test_a_judge_that_learns_on_begins_as_it_was_and_leaves_the_first_alone():
-    known, more = quadrilaterals(5, 300), quadrilaterals(6, 600)
-    first = train_judge(known, CONFIG)
+    gathered, more = quadrilaterals(5, 300), quadrilaterals(6, 600)
+    first = train_judge(gathered, CONFIG)
     before = judged(first, more)[0]
     on = train_judge(more, CONFIG, first)
     after = judged(on, more)[0]
@@ -295,9 +295,9 @@ def quick(monkeypatch):
 
 
 def shipped(order):
-    told: list[tuple[float, str]] = []
-    shipment.ship(order, lambda share, doing: told.append((share, doing)))
-    return told
+    progress: list[tuple[float, str]] = []
+    shipment.ship(order, lambda share, doing: progress.append((share, doing)))
+    return progress
 
 
 def digests(folder):
@@ -306,7 +306,7 @@ def digests(folder):
 
 @pytest.mark.slow
 def test_a_training_is_shipped_with_a_manifest_that_the_detector_accepts(into, run, quick):
-    told = shipped(Order(source=run, into=into, precision="float32", judge_images=130, lane_images=110))
+    progress = shipped(Order(source=run, into=into, precision="float32", judge_images=130, lane_images=110))
     weights._problem.cache_clear()
     weights.check_weights(into)
     files = weights.read_manifest(into)["files"]
@@ -317,7 +317,7 @@ def test_a_training_is_shipped_with_a_manifest_that_the_detector_accepts(into, r
     assert all(entry["sha256"] != before[name] for name, entry in files.items())
     assert read_exported(into / "marking_net.onnx").label["steps"] == 3
     assert [numbers.stop for numbers in quick] == [25, 50, 75, 100, 125, 130]
-    shares = [share for share, _ in told]
+    shares = [share for share, _ in progress]
     assert shares == sorted(shares)
     assert not list(Path("runs").iterdir()), "what was kept to go on from is gone"
 

@@ -42,9 +42,9 @@ def crosswalk(ground=90, paint=190):
 
 def labelled(folder, image, shape, **settings):
     cv2.imwrite(str(folder / "a.png"), image)
-    given = LabelledImage("", folder / "a.png", shapes=(shape,), edge_px=3.0)
+    plain = LabelledImage("", folder / "a.png", shapes=(shape,), edge_px=3.0)
     config = DataConfig(coco_tone=True, coco_camera=MOUNTING, **settings)
-    (hinted,) = with_hints([given], config, lambda share: None)
+    (hinted,) = with_hints([plain], config, lambda share: None)
     return paint_labels(hinted, Place.whole(image.shape[1], image.shape[0]))
 
 
@@ -99,11 +99,11 @@ def test_a_line_across_the_way_is_a_stop_line_and_one_along_it_is_not(tmp_path, 
     road = RoadCamera(camera_from_calibration(rough_calibration("", 1280, 720, *MOUNTING)))
     shape = np.array([[0, 0], [ahead_m, 0], [ahead_m, left_m], [0, left_m]])
     ring = road.distort(apply_homography(road.pinhole_px_from_vehicle, shape + np.array([6.0, -left_m / 2])))
-    given = LabelledImage("", tmp_path / "a.png", shapes=(Shape((LANE_DASH, LANE_LINE, STOP_LINE), (ring,)),))
-    (hinted,) = with_hints([given], DataConfig(coco_camera=MOUNTING), lambda share: None)
-    (found,) = hinted.shapes or ()
+    image = LabelledImage("", tmp_path / "a.png", shapes=(Shape((LANE_DASH, LANE_LINE, STOP_LINE), (ring,)),))
+    (hinted,) = with_hints([image], DataConfig(coco_camera=MOUNTING), lambda share: None)
+    (stop_line,) = hinted.shapes or ()
     other = {STOP_LINE: {LANE_DASH, LANE_LINE}, LANE_DASH: {STOP_LINE}}[kind]
-    assert not other & set(found.kinds)
+    assert not other & set(stop_line.kinds)
 
 
 def small(folder, **settings):
@@ -120,8 +120,8 @@ def listed(folder, name, content):
 def test_listed_annotations_are_of_the_category_that_the_list_is_of(tmp_path, content):
     config = small(tmp_path, coco_relabel={STOP_LINE: listed(tmp_path, "stop_lines.json", content)})
     assert [shape.kinds for image in read_labels(config).images for shape in image.shapes] == [(STOP_LINE,)]
-    own = {"halt": listed(tmp_path, "halt.json", content)}
-    config = small(tmp_path, coco_relabel=own, coco_classes={"halt": STOP_LINE})
+    lists = {"halt": listed(tmp_path, "halt.json", content)}
+    config = small(tmp_path, coco_relabel=lists, coco_classes={"halt": STOP_LINE})
     assert [shape.kinds for image in read_labels(config).images for shape in image.shapes] == [(STOP_LINE,)]
 
 
@@ -191,8 +191,8 @@ def heads_alone(folder, **changes):
 def test_heads_that_learn_alone_keep_to_the_classes_of_their_start(tmp_path):
     image = torch.randint(0, 256, (4, 32, 64, 3), dtype=torch.uint8)
     moved = []
-    for kept in (0.0, 30.0):
-        trainer = heads_alone(tmp_path, output=str(tmp_path / f"kept{kept}"), loss=LossConfig(kept=kept))
+    for weight in (0.0, 30.0):
+        trainer = heads_alone(tmp_path, output=str(tmp_path / f"kept{weight}"), loss=LossConfig(kept=weight))
         # Paint is seen everywhere, so that the classes of bare ground are kept, too.
         for net in (trainer.net, trainer._before):
             torch.nn.init.constant_(net.paint.bias, 50.0)
@@ -255,8 +255,8 @@ def test_the_judge_learns_a_stop_line_as_thin_as_its_paint(tmp_path):
     ring = outline(300, 490, 900, 520)
     shape = Shape((STOP_LINE,), (ring,), tone_of(log_light(image), [ring], False))
     config = DataConfig(coco_camera=MOUNTING)
-    given = LabelledImage("", tmp_path / "a.png", shapes=(shape,))
-    (marking,) = photograph(given, config, np.random.default_rng(0)).markings
+    plain = LabelledImage("", tmp_path / "a.png", shapes=(shape,))
+    (marking,) = photograph(plain, config, np.random.default_rng(0)).markings
     assert marking.kind == STOP_LINE
     assert np.ptp(marking.polygon_px, axis=0).tolist() == pytest.approx([600, 8], abs=1)
 

@@ -20,8 +20,8 @@ def test_a_checkpoint_scores_what_its_training_recorded(tmp_path):
     config = tiny(tmp_path / "run")
     train(config)
     recorded = load_checkpoint(tmp_path / "run" / "best.pt").metrics
-    asked = replace(config, start=str(tmp_path / "run" / "best.pt"), output=str(tmp_path / "other"))
-    assert scores_of(asked, silent)["2 renders"].figures() == pytest.approx(recorded)
+    score_config = replace(config, start=str(tmp_path / "run" / "best.pt"), output=str(tmp_path / "other"))
+    assert scores_of(score_config, silent)["2 renders"].figures() == pytest.approx(recorded)
 
 
 def test_held_out_photographs_are_a_set_of_their_own(tmp_path):
@@ -36,8 +36,8 @@ def test_held_out_photographs_are_a_set_of_their_own(tmp_path):
     train(config)
     data = DataConfig(**(vars(config.data) | {"coco": str(labels), "coco_held_out": True}))
     start = str(tmp_path / "run" / "last.pt")
-    asked = replace(config, start=start, output=str(tmp_path / "other"), data=data)
-    assert list(scores_of(asked, silent)) == ["2 renders", f"{sum(is_held)} photographs"]
+    score_config = replace(config, start=start, output=str(tmp_path / "other"), data=data)
+    assert list(scores_of(score_config, silent)) == ["2 renders", f"{sum(is_held)} photographs"]
 
 
 def test_nothing_to_score_is_an_error(tmp_path):

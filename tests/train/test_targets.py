@@ -92,24 +92,24 @@ def test_small_pieces_and_what_is_around_them_weigh_more():
 
 def test_a_line_crosses_each_row_anchor_in_one_cell():
     line = np.array([[10.0, 40.0], [42.0, -10.0]])
-    there, offset = lane_targets([line], 32, 64)
-    assert (there == 1).sum(axis=1).tolist() == [1, 1, 1, 1]
+    has_line, offset = lane_targets([line], 32, 64)
+    assert (has_line == 1).sum(axis=1).tolist() == [1, 1, 1, 1]
     for row in range(4):
-        (column,) = np.flatnonzero(there[row] == 1)
+        (column,) = np.flatnonzero(has_line[row] == 1)
         u = 8 * (column + offset[row, column]) + 3.5
         assert u == pytest.approx(10 + 32 * (40 - (8 * row + 3.5)) / 50, abs=1e-5)
 
 
 def test_a_crossing_near_the_next_cell_leaves_that_one_open():
-    there, offset = lane_targets([np.array([[15.3, 20.0], [15.3, -5.0]])], 16, 32)
-    assert there.tolist() == [[0, 1, IGNORE, 0]] * 2
+    has_line, offset = lane_targets([np.array([[15.3, 20.0], [15.3, -5.0]])], 16, 32)
+    assert has_line.tolist() == [[0, 1, IGNORE, 0]] * 2
     assert offset[0, 1] == pytest.approx((15.3 + 0.5) / 8 - 1.5)
 
 
 def test_a_line_along_the_row_anchors_asks_for_nothing():
-    there, _ = lane_targets([np.array([[2.0, 5.0], [60.0, 2.0]])], 16, 64)
-    assert 1 not in there
-    assert IGNORE in there
+    has_line, _ = lane_targets([np.array([[2.0, 5.0], [60.0, 2.0]])], 16, 64)
+    assert 1 not in has_line
+    assert IGNORE in has_line
 
 
 def test_a_line_behind_a_box_may_be_found_or_not():
@@ -119,8 +119,8 @@ def test_a_line_behind_a_box_may_be_found_or_not():
     sample = TrainingSample(
         np.zeros((32, 64, 3), np.uint8), labels, hidden, (np.array([[30.0, 40.0], [30.0, -5.0]]),)
     )
-    there = targets(sample).lane_there.numpy()
-    assert (there[:, 3] == [IGNORE, IGNORE, 1, 1]).all()
+    has_line = targets(sample).lane_there.numpy()
+    assert (has_line[:, 3] == [IGNORE, IGNORE, 1, 1]).all()
 
 
 KINDS = len(PAINT_CLASSES)
@@ -133,8 +133,8 @@ def sure(labels):
 
 def sure_kinds(labels):
     """Logits (B, K, H, W) that are all but certain of the given classes."""
-    known = torch.where(labels == IGNORE, 0, labels).long()
-    return 30.0 * torch.nn.functional.one_hot(known, KINDS).permute(0, 3, 1, 2).float()
+    labels_or_zero = torch.where(labels == IGNORE, 0, labels).long()
+    return 30.0 * torch.nn.functional.one_hot(labels_or_zero, KINDS).permute(0, 3, 1, 2).float()
 
 
 def example():
@@ -143,13 +143,13 @@ def example():
     paint[0, :2, :4] = 1
     kinds = torch.full((1, 2, 4), IGNORE, dtype=torch.uint8)
     kinds[0, 0, :2] = 3
-    there = torch.tensor([[[0, 1]]], dtype=torch.uint8)
+    has_line = torch.tensor([[[0, 1]]], dtype=torch.uint8)
     offset = torch.tensor([[[0.0, 0.25]]])
     prediction = Prediction(
-        sure(paint)[:, None], sure_kinds(kinds), torch.stack([sure(there), offset], dim=1)
+        sure(paint)[:, None], sure_kinds(kinds), torch.stack([sure(has_line), offset], dim=1)
     )
     worth = torch.ones(kinds.shape)
-    return prediction, Targets(paint, worth, kinds, worth, there, offset)
+    return prediction, Targets(paint, worth, kinds, worth, has_line, offset)
 
 
 def test_certain_and_right_costs_nothing():
@@ -202,14 +202,14 @@ def test_what_was_said_of_classes_is_kept_where_no_label_says_otherwise():
     before = torch.zeros(1, KINDS, 1, 6)
     before[0, 0] = 2.0  # the first class everywhere
     of_cells = torch.tensor([5.0, 5.0, 5.0, 5.0, 5.0, -5.0])
-    seen = of_cells.repeat_interleave(2)[None, None, None].repeat(1, 1, 2, 1)
+    is_seen = of_cells.repeat_interleave(2)[None, None, None].repeat(1, 1, 2, 1)
     # Of the same class, bare, of another class, paint of an unknown one, unknown ground, not seen as paint.
     answers = answers_for_cells([1, 0, 1, 1, IGNORE, 0], [0, IGNORE, 1, IGNORE, IGNORE, IGNORE])
-    assert float(kept_loss(before, before, seen, answers)) == 0
+    assert float(kept_loss(before, before, is_seen, answers)) == 0
     moved = before.clone().requires_grad_()
     with torch.no_grad():
         moved[0, 1] += 3.0
-    loss = kept_loss(moved, before, seen, answers)
+    loss = kept_loss(moved, before, is_seen, answers)
     log_share = before[0, :, 0, 0].log_softmax(0)
     expected = (log_share.exp() * (log_share - moved[0, :, 0, 0].log_softmax(0))).sum()
     assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
@@ -254,20 +254,20 @@ def test_the_score_counts_by_hand():
 
 
 def test_a_crossing_two_cells_off_is_neither_found_nor_right():
-    there = torch.zeros((1, 1, 8), dtype=torch.uint8)
-    there[..., 2] = 1
-    for found, right in ((3, 1.0), (4, 0.0)):
-        given = torch.zeros((1, 1, 8), dtype=torch.uint8)
-        given[..., found] = 1
+    has_line = torch.zeros((1, 1, 8), dtype=torch.uint8)
+    has_line[..., 2] = 1
+    for column, right in ((3, 1.0), (4, 0.0)):
+        answer = torch.zeros((1, 1, 8), dtype=torch.uint8)
+        answer[..., column] = 1
         paint = torch.zeros((1, 4, 32), dtype=torch.uint8)
         kinds = torch.full((1, 2, 16), IGNORE, dtype=torch.uint8)
         nothing = torch.zeros(kinds.shape)
         tally = Tally()
         tally.add(
             Prediction(
-                sure(paint)[:, None], sure_kinds(kinds), torch.stack([sure(given), sure(given)], dim=1)
+                sure(paint)[:, None], sure_kinds(kinds), torch.stack([sure(answer), sure(answer)], dim=1)
             ),
-            Targets(paint, nothing, kinds, nothing, there, torch.zeros((1, 1, 8))),
+            Targets(paint, nothing, kinds, nothing, has_line, torch.zeros((1, 1, 8))),
         )
         assert (tally.score().lane_recall, tally.score().lane_precision) == (right, right)
 
@@ -291,9 +291,9 @@ def tusimple(folder, name="a.png", **changes):
 
 
 def labelled(**files):
-    found = read_labels(config(**files))
-    assert found is not None
-    return found
+    labels_read = read_labels(config(**files))
+    assert labels_read is not None
+    return labels_read
 
 
 def test_a_rectangle_between_pixels_covers_its_exact_area():
@@ -392,9 +392,9 @@ def test_views_of_tusimple_images_answer_for_lanes_only(tmp_path):
 def test_an_image_in_both_files_has_both_labels(tmp_path):
     labels = labelled(coco=str(coco(tmp_path)), tusimple=str(tusimple(tmp_path)))
     assert len(labels.images) == 2
-    both = next(image for image in labels.images if image.path.name == "a.png")
-    assert both.shapes
-    (lane,) = both.lanes_px or ()
+    image = next(image for image in labels.images if image.path.name == "a.png")
+    assert image.shapes
+    (lane,) = image.lanes_px or ()
     np.testing.assert_array_equal(lane[0], [70, 60])
 
 
@@ -463,15 +463,15 @@ def test_an_outline_with_paint_somewhere_in_it_is_paint_where_the_network_sees_s
     cv2.imwrite(str(tmp_path / "a.png"), image)
     ring = np.array([[30.0, 50], [150, 50], [150, 110], [30, 110]])
     shapes = (Shape((CROSSWALK_BAR, "none"), (ring,)),)
-    given = LabelledImage("", tmp_path / "a.png", shapes=shapes)
-    (hinted,) = with_hints([given], config(coco_complete=[DIAMOND]), lambda share: None)
+    plain = LabelledImage("", tmp_path / "a.png", shapes=shapes)
+    (hinted,) = with_hints([plain], config(coco_complete=[DIAMOND]), lambda share: None)
     labels, unknown = paint_labels(hinted, Place.whole(256, 128))
     assert unknown[50:109, 31:149].all()
     bar = 1 + PAINT_CLASSES.index(CROSSWALK_BAR)
     assert set(np.unique(labels)) == {0, bar}
     assert (labels[70:90, 48:64] == bar).mean() > 0.9
     assert (labels[70:90, 80:100] == 0).mean() > 0.9
-    hidden = replace(given, shapes=())
+    hidden = replace(plain, shapes=())
     (silent,) = with_hints([hidden], config(coco_complete=[DIAMOND]), lambda share: None)
     _, unknown = paint_labels(silent, Place.whole(256, 128))
     (complete,) = with_hints([hidden], config(coco_complete=list(PAINT_CLASSES)), lambda share: None)
@@ -487,10 +487,10 @@ def test_a_line_is_of_the_class_that_its_size_on_the_ground_tells(tmp_path):
     for kind, far, left in (("lane_line", 40.0, 1.15), (DIAMOND, 5.5, 2.5)):
         ground = np.array([[4.0, 1.0], [far, 1.0], [far, left], [4.0, left]])
         ring = road.distort(apply_homography(road.pinhole_px_from_vehicle, ground))
-        given = LabelledImage("", tmp_path / "a.png", shapes=(Shape(either, (ring,)),))
-        (hinted,) = with_hints([given], config(coco_camera=camera), lambda share: None)
+        image = LabelledImage("", tmp_path / "a.png", shapes=(Shape(either, (ring,)),))
+        (hinted,) = with_hints([image], config(coco_camera=camera), lambda share: None)
         assert [shape.kinds for shape in hinted.shapes or ()] == [(kind,)]
-    unclear = replace(given, shapes=(Shape((ARROW, DIAMOND), (np.array([[0.0, 0], [9, 0], [9, 9]]),)),))
+    unclear = replace(image, shapes=(Shape((ARROW, DIAMOND), (np.array([[0.0, 0], [9, 0], [9, 9]]),)),))
     (hinted,) = with_hints([unclear], config(), lambda share: None)
     assert [shape.kinds for shape in hinted.shapes or ()] in ([(ANY,)], [(ARROW,)], [(DIAMOND,)])
     labels = painted([Shape((ANY,), (np.array([[0.0, 0], [9, 0], [9, 9], [0, 9]]),))], 16, 16)

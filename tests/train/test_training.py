@@ -48,8 +48,8 @@ def test_the_loss_falls_on_a_batch_seen_again_and_again(tmp_path):
     image[:, 8:24, 16:40] = 230
     labels[8:24, 16:40] = 1
     lane = np.array([[20.0, 40.0], [30.0, -5.0]])
-    one = targets(TrainingSample(image[0].numpy(), labels, labels > 9, (lane,)))
-    batch = image, Targets(*(torch.stack([target, target]) for target in one))
+    of_sample = targets(TrainingSample(image[0].numpy(), labels, labels > 9, (lane,)))
+    batch = image, Targets(*(torch.stack([target, target]) for target in of_sample))
     losses = [trainer._update(batch) for _ in range(50)]
     assert losses[-1] < 0.3 * losses[0]
 
@@ -132,13 +132,15 @@ def test_a_recipe_trains_from_nothing_and_goes_on_after_a_kill(tmp_path):
 
 
 def test_a_worker_for_each_core_is_one_or_more(monkeypatch, tmp_path):
-    made: list[int] = []
-    monkeypatch.setattr(data, "DataLoader", lambda *_, num_workers, **__: made.append(num_workers) or [])
+    worker_counts: list[int] = []
+    monkeypatch.setattr(
+        data, "DataLoader", lambda *_, num_workers, **__: worker_counts.append(num_workers) or []
+    )
     for cores, part in ((8, (0, 1)), (8, (1, 2)), (1, (0, 1)), (None, (0, 1))):
         monkeypatch.setattr(data.os, "cpu_count", lambda cores=cores: cores)
         data.training_batches(DataConfig(workers=None), 1, 2, 0, part)
     data.training_batches(DataConfig(workers=0), 1, 2, 0)
-    assert made == [7, 3, 1, 1, 0]
+    assert worker_counts == [7, 3, 1, 1, 0]
 
 
 def test_the_average_follows_a_short_run_and_forgets_its_random_start(tmp_path):
@@ -215,17 +217,17 @@ def team(tmp_path_factory):
     folder = tmp_path_factory.mktemp("team")
     launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     command = [*launch, "-m", "tests.train.team_member", str(folder)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
+    assert process.returncode == 0, process.stderr
     return folder, [torch.load(folder / f"member{rank}.pt", weights_only=True) for rank in range(2)]
 
 
 @pytest.mark.slow
 def test_all_members_end_with_identical_weights(team):
-    _, (one, other) = team
+    _, (first, other) = team
     for kind in ("net", "averaged"):
-        assert one[kind].keys() == other[kind].keys()
-        for name, value in one[kind].items():
+        assert first[kind].keys() == other[kind].keys()
+        for name, value in first[kind].items():
             assert torch.equal(value, other[kind][name]), f"{kind} {name}"
 
 
@@ -234,9 +236,9 @@ def test_an_average_is_that_of_all_members(team):
 
 
 def test_no_two_members_see_the_same_render(team):
-    _, (one, other) = team
-    assert one["seen"]
-    assert not set(one["seen"]) & set(other["seen"])
+    _, (first, other) = team
+    assert first["seen"]
+    assert not set(first["seen"]) & set(other["seen"])
 
 
 def test_the_team_goes_on_where_it_was_left(team):

@@ -75,10 +75,10 @@ def test_an_outline_of_a_diamond_is_a_diamond_and_its_middle_shows_the_ground():
     info = CameraInfo("down", 120, 120, np.array([[100.0, 0, 60], [0, 100.0, 60], [0, 0, 1]]))
     above = looking(np.array([6.0, 0.0, 3.0]), 0.0, np.pi / 2, 0.0)
     ground = Ground(albedo_bgr=(0.1, 0.1, 0.1), contrast=0.0, stains=0.0)
-    seen = []
+    rendered = []
     for paints in ([Paint(kind=DIAMOND, polygon_map=corners)], hollow_diamond(brush, rng, corners, 0.2)):
-        seen.append(Renderer(Scene(ground=ground, paints=tuple(paints))).render(info, above, rng))
-    filled, hollow = seen
+        rendered.append(Renderer(Scene(ground=ground, paints=tuple(paints))).render(info, above, rng))
+    filled, hollow = rendered
     assert (filled.labels == hollow.labels).mean() > 0.999
     assert filled.image[60, 60, 1] > 2 * hollow.image[60, 60, 1]
     ring = (hollow.labels > 0) & (hollow.image[..., 1] > 2 * hollow.image[60, 60, 1])
@@ -100,7 +100,7 @@ def test_half_of_the_arrows_face_the_camera_when_half_are_asked_to():
     for seed in range(60):
         brush = Brush((0.7, 0.7, 0.7), 0.0, 0.0)
         facing = [Facing(np.random.default_rng(seed), share) for share in (0.0, 0.5)]
-        roads = [street_paint(np.random.default_rng(seed), brush, Bend(0.0), one) for one in facing]
+        roads = [street_paint(np.random.default_rng(seed), brush, Bend(0.0), share) for share in facing]
         arrows = [[p.polygon_map for p in road.paints if p.kind == ARROW] for road in roads]
         assert len(arrows[0]) == len(arrows[1])
         turned += [not np.allclose(a, b) for a, b in zip(*arrows, strict=True)]
@@ -129,9 +129,9 @@ def test_a_stop_line_that_meets_lines_of_lanes_reaches_from_one_to_another():
 
 
 def test_words_are_strokes_of_their_size_in_the_order_in_which_they_are_read():
-    near, far = (list(word(text, 2.0, 0.5, 0.1)) for text in ("BUS", "BUS LANE"))
+    short_word, far = (list(word(text, 2.0, 0.5, 0.1)) for text in ("BUS", "BUS LANE"))
     assert all(signed_area(stroke) > 0 for stroke in far)
-    assert np.ptp(np.vstack(near)[:, 0]) == pytest.approx(2.1, abs=0.05)
+    assert np.ptp(np.vstack(short_word)[:, 0]) == pytest.approx(2.1, abs=0.05)
     assert np.vstack(far)[:, 0].max() == pytest.approx(4.85, abs=0.05)
     left_i, right_l = (np.vstack(list(word(text, 2.0, 0.5, 0.1)))[:, 1] for text in ("I", "LI"))
     assert right_l.max() > left_i.max()

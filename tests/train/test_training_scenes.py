@@ -57,9 +57,9 @@ def test_a_seed_and_an_index_make_the_same_picture_again():
 
 
 def test_streams_of_one_seed_are_the_same():
-    one, other = iter(RenderStream(TINY, 1)), iter(RenderStream(TINY, 1))
+    stream, other = iter(RenderStream(TINY, 1)), iter(RenderStream(TINY, 1))
     for _ in range(5):
-        (image, answers), (image_again, answers_again) = next(one), next(other)
+        (image, answers), (image_again, answers_again) = next(stream), next(other)
         assert image.shape == (32, 64, 3)
         assert answers.paint.shape == (16, 32)
         assert bool((image == image_again).all())
@@ -72,8 +72,8 @@ def test_validation_shows_other_scenes_than_training():
 
 
 def test_all_classes_are_seen_in_a_hundred_or_so_samples():
-    seen = {int(c) for index in range(120) for c in np.unique(training_sample(2, index, 320, 192).labels)}
-    assert seen == set(range(1 + len(PAINT_CLASSES)))
+    classes = {int(c) for index in range(120) for c in np.unique(training_sample(2, index, 320, 192).labels)}
+    assert classes == set(range(1 + len(PAINT_CLASSES)))
 
 
 def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them():
@@ -90,7 +90,7 @@ def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them():
 
 
 def test_lanes_lie_on_their_paint():
-    on_paint, seen = 0, 0
+    on_paint, inside_count = 0, 0
     for index in range(60):
         sample = training_sample(3, index, 192, 96, difficulty=0.0)
         lane_paint = np.isin(sample.labels, [1 + PAINT_CLASSES.index(kind) for kind in SHIPPED.lane_paint])
@@ -98,10 +98,10 @@ def test_lanes_lie_on_their_paint():
             u, v = np.round(lane).astype(int).T
             inside = (u >= 0) & (u < 192) & (v >= 30) & (v < 96)
             inside[inside] = ~sample.hidden[v[inside], u[inside]]
-            seen += inside.sum()
+            inside_count += inside.sum()
             on_paint += lane_paint[v[inside], u[inside]].sum()
-    assert seen > 300
-    assert 0.4 < on_paint / seen < 0.95, "dashes leave gaps, double lines are bare between"
+    assert inside_count > 300
+    assert 0.4 < on_paint / inside_count < 0.95, "dashes leave gaps, double lines are bare between"
 
 
 def test_a_line_is_the_middle_of_the_strands_that_run_there_and_follows_the_one_that_goes_on():
@@ -116,9 +116,9 @@ def test_a_line_is_the_middle_of_the_strands_that_run_there_and_follows_the_one_
                 continue
             doubles += 1
             for along, left in lane:
-                near = [(along + passing > start) & (along - passing < end) for start, end, _ in strands]
+                is_near = [(along + passing > start) & (along - passing < end) for start, end, _ in strands]
                 here = [(along - passing > start) & (along + passing < end) for start, end, _ in strands]
-                if near != here or not any(here):
+                if is_near != here or not any(here):
                     continue
                 one_of_two += sum(here) == 1
                 assert left == pytest.approx(np.mean([strands[k][2] for k in np.flatnonzero(here)]), abs=1e-6)
@@ -209,11 +209,11 @@ def pairs(hard, count):
 
 @pytest.mark.parametrize("name", [f.name for f in fields(Hardships) if f.name not in ELSEWHERE])
 def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name):
-    seen = pairs(Hardships(**{name: 3.0}), 8)
-    for plain, hard in seen:
+    scene_pairs = pairs(Hardships(**{name: 3.0}), 8)
+    for plain, hard in scene_pairs:
         np.testing.assert_array_equal(plain.labels, hard.labels)
         np.testing.assert_array_equal(plain.hidden, hard.hidden)
-    assert any((plain.image != hard.image).any() for plain, hard in seen)
+    assert any((plain.image != hard.image).any() for plain, hard in scene_pairs)
 
 
 CROWDS = {
@@ -228,12 +228,12 @@ CROWDS = {
 
 @pytest.mark.parametrize(("name", "much"), CROWDS.items())
 def test_things_beside_markings_hide_paint_and_add_none(name, much):
-    seen = pairs(Hardships(**{name: much}), 12)
-    for plain, crowded in seen:
+    scene_pairs = pairs(Hardships(**{name: much}), 12)
+    for plain, crowded in scene_pairs:
         changed = plain.labels != crowded.labels
         assert (crowded.labels[changed] == 0).all()
         assert crowded.hidden[plain.hidden].all()
-    assert any((plain.hidden != crowded.hidden).any() for plain, crowded in seen)
+    assert any((plain.hidden != crowded.hidden).any() for plain, crowded in scene_pairs)
 
 
 def test_scenes_without_hardships_show_words_boxes_and_symbols_too():
@@ -258,19 +258,19 @@ def test_a_picture_lies_on_its_face_from_the_upper_left_as_seen_from_outside():
     picture[0, 0], picture[0, 1], picture[1, 0] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
     box = Box(centre_map=(6.0, 0.0), size_m=(2.0, 2.0, 2.0), pictures=(None, partial(reflectance, picture)))
     info = CameraInfo("c", 120, 80, np.array([[100.0, 0, 60], [0, 100.0, 40], [0, 0, 1]]))
-    seen = Renderer(Scene(boxes=(box,))).render(
+    rendered = Renderer(Scene(boxes=(box,))).render(
         info, looking(np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 0.0), np.random.default_rng(0)
     )
-    assert [int(seen.image[v, u].argmax()) for v, u in ((28, 48), (28, 72), (52, 48))] == [0, 1, 2]
-    assert seen.image[52, 72].max() < 60
+    assert [int(rendered.image[v, u].argmax()) for v, u in ((28, 48), (28, 72), (52, 48))] == [0, 1, 2]
+    assert rendered.image[52, 72].max() < 60
 
 
 def test_the_own_bonnet_hides_the_bottom_of_the_image():
-    plain, own = (
-        [training_sample(6, k, 96, 64, hardships=given) for k in range(12)]
-        for given in (Hardships(), Hardships(own_vehicle=1.0))
+    plain, with_bonnet = (
+        [training_sample(6, k, 96, 64, hardships=hardships) for k in range(12)]
+        for hardships in (Hardships(), Hardships(own_vehicle=1.0))
     )
-    low = [b.hidden[-4:].mean() - a.hidden[-4:].mean() for a, b in zip(plain, own, strict=True)]
+    low = [b.hidden[-4:].mean() - a.hidden[-4:].mean() for a, b in zip(plain, with_bonnet, strict=True)]
     assert np.mean([share > 0.5 for share in low]) > 0.3
 
 
@@ -316,7 +316,7 @@ def test_bleached_ground_keeps_its_tint_and_is_clipped_together_with_its_paint()
     np.testing.assert_allclose(np.array(lighter.albedo_bgr) / ground.albedo_bgr, lighter.albedo_bgr[0] / 0.1)
     assert bleached(np.random.default_rng(0), ground, 0.0) is ground
     samples = [(0.0, 2, index) for index in range(50)], [(1.0, 2, index) for index in range(50)]
-    clipped = [np.mean([_clipped_beside_paint(*sample) for sample in each]) for each in samples]
+    clipped = [np.mean([_clipped_beside_paint(*sample) for sample in sample_list]) for sample_list in samples]
     assert clipped[0] < 0.01
     assert clipped[1] > 0.05
 
@@ -346,8 +346,8 @@ def test_a_junction_has_arrows_before_its_stop_line_and_a_crosswalk_behind_it():
 
 def test_seams_run_along_sides_however_short():
     corners = 0.02 * np.array([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0], [-1.0, 0.0]]) + [5.0, 0.0]
-    made = [
+    marks_made = [
         with_side_seams(np.random.default_rng(k), None, [Paint(kind=DIAMOND, polygon_map=corners)], 3.0)
         for k in range(100)
     ]
-    assert any(marks is not None and marks.factor.std() > 0 for marks in made)
+    assert any(marks is not None and marks.factor.std() > 0 for marks in marks_made)

@@ -81,10 +81,10 @@ def test_a_camera_on_the_side_looks_across_the_way_at_a_place_that_it_passes():
 def test_a_camera_on_the_side_is_to_take_dashes_for_stop_lines(monkeypatch, painted, answer):
     paint = Paint(kind=painted, polygon_map=rectangle(np.array([12.0, 3.0]), 2.0, 0.3))
     monkeypatch.setattr(scenes, "random_scene", lambda *_: (Scene(paints=(paint,)), []))
-    found = set()
+    classes = set()
     for index in range(6):
-        found |= set(np.unique(training_sample(3, index, 320, 180, hardships=Hardships(aside=1.0)).labels))
-    assert found == {0, 1 + PAINT_CLASSES.index(answer)}
+        classes |= set(np.unique(training_sample(3, index, 320, 180, hardships=Hardships(aside=1.0)).labels))
+    assert classes == {0, 1 + PAINT_CLASSES.index(answer)}
 
 
 def test_no_lens_folds_an_image_over_itself():
@@ -120,7 +120,7 @@ def test_crops_keep_image_labels_hidden_and_lanes_together():
     image[20, 30] = 250
     whole = TrainingSample(image, labels, labels > 2, (np.array([[30.0, 20.0], [31.0, 10.0]]),))
     rng = np.random.default_rng(1)
-    seen = 0
+    count = 0
     for _ in range(40):
         crop = random_crop(rng, whole, 32, 16)
         assert crop.image.shape == (16, 32, 3)
@@ -129,5 +129,5 @@ def test_crops_keep_image_labels_hidden_and_lanes_together():
         np.testing.assert_array_equal(crop.hidden, crop.labels > 2)
         for row, column in np.argwhere(bright):
             np.testing.assert_array_equal(crop.lanes_px[0][0], [column, row])
-            seen += 1
-    assert seen > 3
+            count += 1
+    assert count > 3

@@ -44,8 +44,8 @@ def calibrated(covariance=SURE, pitch_deg=15.0):
 
 def mapped(markings, calibration=None, position_m=0.003):
     still = np.tile(np.eye(4), (5, 1, 1))
-    sigma, seen = np.full((5, 6), position_m), np.ones(5, dtype=bool)
-    poses = AdjustedPoses(np.arange(5.0), still, still, sigma, seen, {}, np.zeros(5, dtype=np.int64))
+    sigma, is_seen = np.full((5, 6), position_m), np.ones(5, dtype=bool)
+    poses = AdjustedPoses(np.arange(5.0), still, still, sigma, is_seen, {}, np.zeros(5, dtype=np.int64))
     calibrations = {"front": calibration or calibrated()}
     hd_map = graded(HDMap(tuple(markings)), 0.05)
     return MethodResult("Opt", ("front",), hd_map, calibrations, poses=poses)
@@ -59,12 +59,12 @@ def with_clocks(clock_m):
     )  # fmt: skip
 
 
-def judged(one, goal_m=0.05):
-    return Verdict.of(check_goal(one, goal_m, "poses"))
+def judged(result, goal_m=0.05):
+    return Verdict.of(check_goal(result, goal_m, "poses"))
 
 
-def of_map(one, goal_m=0.05):
-    return next(finding for finding in judged(one, goal_m).findings if finding.about == "map")
+def of_map(result, goal_m=0.05):
+    return next(finding for finding in judged(result, goal_m).findings if finding.about == "map")
 
 
 def test_a_good_map_passes_and_says_how_good_it_is_first():
@@ -87,33 +87,35 @@ def test_a_straight_drive_with_70_cm_of_uncertainty_is_no_pass_and_names_the_mou
     )
     says = {finding.about: finding.says for finding in verdict.raised}
     assert "0 % of the markings meet the goal; the largest part" in says["map"]
-    assert all("include a turn, or survey the camera's place" in one for one in says.values())
+    assert all("include a turn, or survey the camera's place" in words for words in says.values())
 
 
 @pytest.mark.parametrize(("coarse", "status"), [(2, Status.PASS), (12, Status.WARN)])
 def test_one_corner_in_twenty_may_miss_the_goal(coarse, status):
     markings = [marking(n, own_m=0.002 if n >= coarse else 0.039) for n in range(100)]
-    found = of_map(mapped(markings))
-    assert found.status is status
-    assert (found.limit, found.unit) == (5.0, "cm")
+    finding = of_map(mapped(markings))
+    assert finding.status is status
+    assert (finding.limit, finding.unit) == (5.0, "cm")
     if status is Status.WARN:
-        assert "88 % of the markings meet the goal" in found.says
-        assert "is each marking's own views: pass them closer" in found.says
+        assert "88 % of the markings meet the goal" in finding.says
+        assert "is each marking's own views: pass them closer" in finding.says
 
 
 def test_the_radius_of_all_corners_holds_for_errors_drawn_from_their_covariances():
-    markings = [marking(n, shared_m=0.001, own_m=own) for n, own in enumerate(np.geomspace(0.003, 0.04, 60))]
+    markings = [
+        marking(n, shared_m=0.001, own_m=own_m) for n, own_m in enumerate(np.geomspace(0.003, 0.04, 60))
+    ]
     radius_m = of_map(mapped(markings)).value / 100
     rng, inside = np.random.default_rng(3), []
-    for one in markings:
-        errors = rng.multivariate_normal(np.zeros(8), one.covariance_m2, 500).reshape(-1, 2)
+    for mapped_marking in markings:
+        errors = rng.multivariate_normal(np.zeros(8), mapped_marking.covariance_m2, 500).reshape(-1, 2)
         inside.append(np.mean(np.hypot(*errors.T) < radius_m))
     assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
 
 
 def test_poses_that_drift_are_named_as_the_largest_part():
-    found = of_map(mapped([marking(n, shared_m=0.05) for n in range(30)], position_m=0.045))
-    assert "the largest part, 11 cm, is the poses: tie them down by mapping.survey" in found.says
+    finding = of_map(mapped([marking(n, shared_m=0.05) for n in range(30)], position_m=0.045))
+    assert "the largest part, 11 cm, is the poses: tie them down by mapping.survey" in finding.says
 
 
 def test_clocks_that_leave_more_open_than_the_goal_are_named_first_and_no_pass():
@@ -152,9 +154,13 @@ def with_lens(*tests):
 
 
 def test_what_no_marking_shows_of_a_lens_is_told_where_it_makes_the_map_miss_the_goal():
-    (told,) = judged(with_lens(of_lens(6.0))).unobservable
-    assert (told.check, told.about, told.status) == ("principal point", "front, rear", Status.PASS)
-    assert "would show from 24 px on, and moves the corners by 9.6 cm until then" in told.says
+    (unobservable,) = judged(with_lens(of_lens(6.0))).unobservable
+    assert (unobservable.check, unobservable.about, unobservable.status) == (
+        "principal point",
+        "front, rear",
+        Status.PASS,
+    )
+    assert "would show from 24 px on, and moves the corners by 9.6 cm until then" in unobservable.says
     assert not judged(with_lens(of_lens(3.0))).unobservable
     assert not judged(with_lens(of_lens(6.0)), goal_m=0.1).unobservable
     assert not judged(with_lens(of_lens(math.inf))).unobservable
@@ -162,8 +168,8 @@ def test_what_no_marking_shows_of_a_lens_is_told_where_it_makes_the_map_miss_the
 
 
 def test_of_a_lens_the_worst_is_told_and_nothing_once_it_is_named_as_wrong():
-    (told,) = judged(with_lens(of_lens(4.0, ("front",)), of_lens(6.0))).unobservable
-    assert "24 px" in told.says
+    (unobservable,) = judged(with_lens(of_lens(4.0, ("front",)), of_lens(6.0))).unobservable
+    assert "24 px" in unobservable.says
     named = with_lens(of_lens(4.0, sigmas=9.0), of_lens(6.0))
     assert not judged(named).unobservable
 

@@ -28,24 +28,24 @@ def judged(frames, *errors_m, survey=None, height_m=0.0):
     """The findings on cameras that the ground shows higher than stated by ``errors_m``."""
     names = [f"cam{k}" for k in range(len(errors_m))]
     stated = replace(frames, height_m=height_m)
-    made = drive(poses(), tuple(names))
+    recorded = drive(poses(), tuple(names))
     cameras = {name: replace(camera(), frames=stated, centre_prior=survey) for name in names}
     ground = {name: estimate(name, up_m=error) for name, error in zip(names, errors_m, strict=True)}
-    return replace(made, cameras=cameras), check_origin_height(replace(made, cameras=cameras), ground)
+    return replace(recorded, cameras=cameras), check_origin_height(replace(recorded, cameras=cameras), ground)
 
 
 @pytest.mark.parametrize("errors_m", [(AXLE_M,), (AXLE_M, AXLE_M + 0.04), (0.2, 0.22, 0.19)])
 @pytest.mark.parametrize("height_m", [0.0, 0.3])
 def test_a_common_error_is_told_with_the_height_to_state(errors_m, height_m):
-    made, (finding,) = judged(TREE, *errors_m, height_m=height_m)
+    recorded, (finding,) = judged(TREE, *errors_m, height_m=height_m)
     expected = height_m + np.mean(errors_m)
     assert finding.status is Status.WARN
     assert f"vehicle_frame_height_m: {expected:.2f}" in finding.says
     verdict = Verdict.of([finding])
-    told = height_to_state(made, verdict)
-    assert told is not None
-    np.testing.assert_allclose(told, expected, atol=0.01)
-    assert known_frames(made.cameras["cam0"], verdict).problem == finding.says
+    height_m_to_state = height_to_state(recorded, verdict)
+    assert height_m_to_state is not None
+    np.testing.assert_allclose(height_m_to_state, expected, atol=0.01)
+    assert known_frames(recorded.cameras["cam0"], verdict).problem == finding.says
 
 
 @pytest.mark.parametrize(
@@ -60,9 +60,9 @@ def test_a_common_error_is_told_with_the_height_to_state(errors_m, height_m):
     ],
 )
 def test_heights_that_are_right_or_one_cameras_own_are_no_finding(frames, errors_m):
-    made, findings = judged(frames, *errors_m)
+    recorded, findings = judged(frames, *errors_m)
     assert all(finding.status is Status.PASS for finding in findings)
-    assert not known_frames(made.cameras["cam0"], Verdict.of(findings)).problem
+    assert not known_frames(recorded.cameras["cam0"], Verdict.of(findings)).problem
 
 
 def test_typed_mountings_that_all_count_from_the_axle_are_told():
@@ -72,10 +72,10 @@ def test_typed_mountings_that_all_count_from_the_axle_are_told():
 
 
 def test_ground_that_shows_no_height_is_said_so():
-    made = drive(poses())
-    made = replace(made, cameras={"front": replace(camera(), frames=TREE)})
+    recorded = drive(poses())
+    recorded = replace(recorded, cameras={"front": replace(camera(), frames=TREE)})
     blind = replace(estimate(), status=GroundStatus.NO_TEXTURE, parameters={})
-    (finding,) = check_origin_height(made, {"front": blind})
+    (finding,) = check_origin_height(recorded, {"front": blind})
     assert finding.is_unobservable
 
 
@@ -83,23 +83,25 @@ def write_bag(folder, tmp_path, below_m, footprint=False):
     """A bag of a rendered floor whose base_link is ``below_m`` above the ground."""
     true = extrinsic()
     rendered = make_drive(folder, 40.0, true)
-    made = Messages()
+    messages = Messages()
     for image in rendered.images:
         data = image.path.read_bytes()
-        made.add(image.stamp_s, "/front/image/compressed", made.compressed(image.stamp_s, data, "png", "eye"))
-        info = made.info(image.stamp_s, rendered.cameras["front"].info, "eye")
-        made.add(image.stamp_s, "/front/camera_info", info)
+        messages.add(
+            image.stamp_s, "/front/image/compressed", messages.compressed(image.stamp_s, data, "png", "eye")
+        )
+        info = messages.info(image.stamp_s, rendered.cameras["front"].info, "eye")
+        messages.add(image.stamp_s, "/front/camera_info", info)
     assert rendered.trajectory is not None
     lift = np.eye(4)
     lift[2, 3] = below_m
     for stamp_s, pose in zip(rendered.trajectory.stamp_s, rendered.trajectory.map_from_vehicle, strict=True):
-        made.add(stamp_s, "/odom", made.odometry(stamp_s, pose @ lift, np.zeros(36), "base_link"))
+        messages.add(stamp_s, "/odom", messages.odometry(stamp_s, pose @ lift, np.zeros(36), "base_link"))
     edges = {("base_link", "eye"): inverse(lift) @ inverse(true)}
     if footprint:
         edges["base_footprint", "base_link"] = lift
-    made.add(0.0, "/tf_static", made.transforms(0.0, edges))
-    made.rows.sort(key=lambda row: row[0])
-    return write_ros2(tmp_path / "site", made)
+    messages.add(0.0, "/tf_static", messages.transforms(0.0, edges))
+    messages.rows.sort(key=lambda row: row[0])
+    return write_ros2(tmp_path / "site", messages)
 
 
 def test_check_asks_for_the_height_of_base_link_and_then_is_content(tmp_path, monkeypatch, capsys):
@@ -107,9 +109,9 @@ def test_check_asks_for_the_height_of_base_link_and_then_is_content(tmp_path, mo
     write_bag(tmp_path / "rendered", tmp_path, AXLE_M)
     write = ["check", "site", "--workers", "1", "--output", "out", "--set", ROI_SET]
     assert run([*write, "--write", "d"]) == 2
-    asked = capsys.readouterr().err.strip().splitlines()[-1]
-    assert "height of base_link above the ground" in asked
-    height_m = float(asked.rpartition("--set vehicle_frame_height_m=")[2])
+    question = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "height of base_link above the ground" in question
+    height_m = float(question.rpartition("--set vehicle_frame_height_m=")[2])
     assert abs(height_m - AXLE_M) < 0.03
     assert not (tmp_path / "d" / "drive.yaml").exists()
     assert run([*write, "vehicle_frame_height_m=0", "--write", "e"]) == 0

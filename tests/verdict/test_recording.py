@@ -26,13 +26,13 @@ def test_poses_that_are_few_have_gaps_or_repeat_are_told():
     recorded = poses()
     assert not check(recorded)
     assert "poses are 1.00 s apart" in check(every(recorded, np.arange(0, 320, 20)))["pose rate"]
-    told = check(every(recorded, np.delete(np.arange(320), np.arange(100, 120))))
-    assert list(told) == ["pose gaps"]
-    assert "gap of 1.05 s" in told["pose gaps"]
+    findings = check(every(recorded, np.delete(np.arange(320), np.arange(100, 120))))
+    assert list(findings) == ["pose gaps"]
+    assert "gap of 1.05 s" in findings["pose gaps"]
     held = every(recorded, np.arange(320) // 5 * 5)  # a log faster than its receiver
-    told = check(Trajectory(recorded.stamp_s, held.map_from_vehicle))
-    assert list(told) == ["repeated poses"]
-    assert "80 %" in told["repeated poses"]
+    findings = check(Trajectory(recorded.stamp_s, held.map_from_vehicle))
+    assert list(findings) == ["repeated poses"]
+    assert "80 %" in findings["repeated poses"]
 
 
 def test_a_vehicle_that_stands_repeats_poses_and_is_fine():
@@ -45,21 +45,23 @@ def test_a_vehicle_that_stands_repeats_poses_and_is_fine():
 @pytest.mark.parametrize(("without", "status"), [(20, Status.WARN), (200, Status.FAIL)])
 def test_images_without_pose_are_counted(without, status):
     some = replace(drive(poses()), unposed={"front": without})
-    found = {finding.check: finding for finding in check_clocks(some, motion(poses()))}["images without pose"]
-    assert found.status is status
-    assert f"{without} of {80 + without} images" in found.says
+    finding = {finding.check: finding for finding in check_clocks(some, motion(poses()))}[
+        "images without pose"
+    ]
+    assert finding.status is status
+    assert f"{without} of {80 + without} images" in finding.says
 
 
 def test_a_camera_that_stops_early_is_told():
     whole = drive(poses(), ("front", "rear"))
     images = [image for image in whole.images if image.camera == "front" or image.stamp_s < 8]
-    told = raised(check_clocks(replace(whole, images=images), motion(poses())))
-    assert "misses 51 %" in told["camera span"]
+    findings = raised(check_clocks(replace(whole, images=images), motion(poses())))
+    assert "misses 51 %" in findings["camera span"]
 
 
 def test_images_farther_apart_than_half_the_roi_are_too_few():
-    told = raised(check_clocks(drive(poses(), every=20), motion(poses())))
-    assert "5.0 m apart and the ROI is 7.0 m deep" in told["image spacing"]
+    findings = raised(check_clocks(drive(poses(), every=20), motion(poses())))
+    assert "5.0 m apart and the ROI is 7.0 m deep" in findings["image spacing"]
 
 
 def test_the_unit_of_stamps_is_named():
@@ -85,9 +87,9 @@ def test_images_of_a_moving_camera_pass(tmp_path):
 
 
 def test_a_camera_that_freezes_is_told(tmp_path):
-    told = raised(check_images(pictured(tmp_path, lambda k: noisy(min(k, 4)))))
-    assert "50 % of the images repeat the one before" in told["frozen images"]
-    assert "first at 2.50 s" in told["frozen images"]
+    findings = raised(check_images(pictured(tmp_path, lambda k: noisy(min(k, 4)))))
+    assert "50 % of the images repeat the one before" in findings["frozen images"]
+    assert "first at 2.50 s" in findings["frozen images"]
 
 
 def test_a_frozen_picture_is_told_although_its_files_differ(tmp_path):
@@ -118,10 +120,14 @@ def test_road_that_is_clipped_is_told_and_a_white_sky_is_none(rows, grey, told, 
 
 
 def test_one_list_of_images_for_two_cameras_is_told(tmp_path):
-    one = pictured(tmp_path, noisy)
-    rear = [replace(image, camera="rear") for image in one.images]
-    both = replace(one, images=[*one.images, *rear], cameras={**one.cameras, "rear": one.cameras["front"]})
-    assert "those of camera 'front' given twice" in raised(check_images(both))["own images"]
+    front_alone = pictured(tmp_path, noisy)
+    rear = [replace(image, camera="rear") for image in front_alone.images]
+    of_both = replace(
+        front_alone,
+        images=[*front_alone.images, *rear],
+        cameras={**front_alone.cameras, "rear": front_alone.cameras["front"]},
+    )
+    assert "those of camera 'front' given twice" in raised(check_images(of_both))["own images"]
 
 
 Spoil = Callable[[Camera], Camera]
@@ -161,8 +167,8 @@ WRONG: dict[str, tuple[Spoil, str, str]] = {
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_camera_is_told(name):
     spoil, check, says = WRONG[name]
-    told = raised(check_camera("front", spoil(camera())))
-    assert says in told[check]
+    findings = raised(check_camera("front", spoil(camera())))
+    assert says in findings[check]
 
 
 def test_a_guess_borrowed_from_a_sister_vehicle_is_fine():

@@ -60,13 +60,13 @@ def result(evidence=FINE, *markings, **changes):
     return replace(MethodResult("Opt", ("front", "rear"), mapped, evidence=evidence), **changes)  # type: ignore[arg-type]
 
 
-def raised(one, drive):
-    found = check_solution(drive, one)
-    return {finding.check: finding for finding in found if finding.status is not Status.PASS}
+def raised(result, drive):
+    findings = check_solution(drive, result)
+    return {finding.check: finding for finding in findings if finding.status is not Status.PASS}
 
 
 @pytest.mark.parametrize(
-    ("check", "status", "about", "kept"),
+    ("check", "status", "about", "is_kept"),
     [
         ("heading", Status.FAIL, "poses", False),
         ("heading", Status.WARN, "poses", True),
@@ -74,11 +74,11 @@ def raised(one, drive):
     ],
     ids=["under poses that failed", "under poses that may be right", "beside a camera that failed"],
 )
-def test_what_a_solve_contradicts_is_told_but_under_poses_that_failed(check, status, about, kept):
+def test_what_a_solve_contradicts_is_told_but_under_poses_that_failed(check, status, about, is_kept):
     before = Finding(check, status, 1.0, 0.5, "", "it is wrong", about)
     passed = Finding("survey", Status.PASS, 1.0, 4.0, "sigmas", "it agrees", "front")
     late = Finding("clock", Status.FAIL, 9.0, 4.0, "sigmas", "it is late", "front, rear")
-    assert told_by_poses([late, passed], [before]) == ([late, passed] if kept else [passed])
+    assert told_by_poses([late, passed], [before]) == ([late, passed] if is_kept else [passed])
 
 
 def test_a_clean_result_raises_nothing(drive):
@@ -88,9 +88,9 @@ def test_a_clean_result_raises_nothing(drive):
 @pytest.mark.parametrize(("ratio", "named"), [(1.2, False), (5.0, True)])
 def test_noise_along_the_way_alone_is_of_stamps_that_jitter(drive, ratio, named):
     noisy = replace(FINE, pose_noise={"position_m": 4.0}, jitter_s=0.02, along_over_across=ratio)
-    found = raised(result(replace(noisy, variance_factor=4.0)), drive)
-    assert ("image stamps" in found) is named
-    assert found["fit"].says.endswith("see image stamps") is named
+    findings = raised(result(replace(noisy, variance_factor=4.0)), drive)
+    assert ("image stamps" in findings) is named
+    assert findings["fit"].says.endswith("see image stamps") is named
     quiet = replace(noisy, jitter_s=0.003)
     assert "image stamps" not in raised(result(quiet), drive)
 
@@ -99,9 +99,9 @@ def test_noise_along_the_way_alone_is_of_stamps_that_jitter(drive, ratio, named)
 def test_stamps_that_may_jitter_are_named_where_the_corners_fit_badly(drive, factor, named):
     """The ratio is that of a made drive whose stamps jitter by 20 ms; right drives reach 1.25."""
     noisy = replace(FINE, pose_noise={"position_m": 6.4}, jitter_s=0.012, along_over_across=2.06)
-    found = raised(result(replace(noisy, variance_factor=factor)), drive)
-    assert ("image stamps" in found) is named
-    assert not named or found["fit"].says.endswith("see image stamps")
+    findings = raised(result(replace(noisy, variance_factor=factor)), drive)
+    assert ("image stamps" in findings) is named
+    assert not named or findings["fit"].says.endswith("see image stamps")
     right = replace(noisy, variance_factor=3.3, along_over_across=1.25)
     assert "image stamps" not in raised(result(right), drive)
 
@@ -114,10 +114,10 @@ def test_stamps_that_jitter_within_the_noise_that_is_allowed_for_are_a_warning(d
 
 def test_an_input_that_was_dropped_is_a_warning_that_names_it(drive):
     dropped = replace(LEVER, value=-1.2, p_value=1e-200)
-    found = raised(result(replace(FINE, corrected=(dropped,))), drive)
-    assert found["survey"].status is Status.WARN
-    assert "antenna" in found["survey"].says
-    assert "120 cm behind" in found["survey"].says
+    findings = raised(result(replace(FINE, corrected=(dropped,))), drive)
+    assert findings["survey"].status is Status.WARN
+    assert "antenna" in findings["survey"].says
+    assert "120 cm behind" in findings["survey"].says
 
 
 @pytest.mark.parametrize(
@@ -134,20 +134,20 @@ def test_a_clock_is_corrected_only_if_no_drift_of_it_is_likelier_than_none(drive
     clock = contradiction(table.CLOCK, mended, 0, "", 0.02, 0.002, 10.0)
     left = contradiction(fault, of, 0, "", value, 0.006, 2.7)
     alone = raised(result(replace(FINE, score_tests=(left,))), drive)
-    found = raised(result(replace(FINE, score_tests=(left,), corrected=(clock,))), drive)
+    findings = raised(result(replace(FINE, score_tests=(left,), corrected=(clock,))), drive)
     assert not alone, "as likely as chance in a drive whose clock is right"
-    assert max((one.status for one in found.values()), key=lambda one: one.rank) is status
+    assert max((finding.status for finding in findings.values()), key=lambda finding: finding.rank) is status
 
 
 def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(drive):
     focal = contradiction(table.FOCAL, ("front", "rear"), 0, "", -0.045, 0.001, 45.0)
     late = replace(CLOCK, value=0.2, p_value=1e-80)
     evidence = replace(FINE, score_tests=(focal, late, LEVER), held_out={"heave": 9.0})
-    found = raised(result(evidence), drive)
-    assert set(found) == {"focal length", "held out"}, "the clock explains less of the same residuals"
-    assert found["focal length"].status is Status.FAIL
-    assert "4.5 % shorter" in found["focal length"].says
-    assert found["held out"].says.endswith("see focal length")
+    findings = raised(result(evidence), drive)
+    assert set(findings) == {"focal length", "held out"}, "the clock explains less of the same residuals"
+    assert findings["focal length"].status is Status.FAIL
+    assert "4.5 % shorter" in findings["focal length"].says
+    assert findings["held out"].says.endswith("see focal length")
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_a_step_within_the_noise_that_is_stated_is_unobservable_however_quiet_th
 @pytest.mark.parametrize(("of_all", "is_told"), [(0.004, True), (0.03, False)])
 def test_a_focal_length_that_both_cameras_may_share_unseen_is_unobservable(of_all, is_told):
     sigmas = {("front",): 0.001, ("rear",): 0.001, ("front", "rear"): of_all}
-    tests = tuple(contradiction(table.FOCAL, who, 0, "", 0.001, one, 1.0) for who, one in sigmas.items())
+    tests = tuple(contradiction(table.FOCAL, who, 0, "", 0.001, sigma, 1.0) for who, sigma in sigmas.items())
     (finding,) = [f for f in check_inputs(replace(FINE, score_tests=tests)) if f.check == "focal length"]
     assert finding.status is Status.PASS
     assert finding.is_unobservable is not is_told
@@ -186,18 +186,18 @@ def test_a_focal_length_that_both_cameras_may_share_unseen_is_unobservable(of_al
 
 
 def test_a_rival_that_explains_as_much_is_named_as_well():
-    one = contradiction(table.SURVEY, ("front",), 0, "", 4.9, 0.1, 37.0)
+    survey = contradiction(table.SURVEY, ("front",), 0, "", 4.9, 0.1, 37.0)
     other = contradiction(table.SURVEY, ("rear",), 0, "", -4.7, 0.1, 36.99)
-    finding = check_inputs(replace(FINE, score_tests=(one, other)))[0]
+    finding = check_inputs(replace(FINE, score_tests=(survey, other)))[0]
     assert "front lies 490 cm ahead of its survey or the centre of rear" in finding.says
 
 
 @pytest.mark.parametrize(("sigmas", "is_told"), [(3.72, True), (2.5, False)])
 def test_an_input_that_may_well_be_wrong_is_a_warning(sigmas, is_told, drive):
     focal = contradiction(table.FOCAL, ("front", "rear"), 0, "", -0.024, 0.0057, sigmas)
-    told = raised(result(replace(FINE, score_tests=(replace(focal, gain=0.2),))), drive)
-    assert [one.status for one in told.values()] == [Status.WARN] * is_told
-    assert not is_told or "2.4 % shorter" in told["focal length"].says
+    findings = raised(result(replace(FINE, score_tests=(replace(focal, gain=0.2),))), drive)
+    assert [finding.status for finding in findings.values()] == [Status.WARN] * is_told
+    assert not is_told or "2.4 % shorter" in findings["focal length"].says
     sure = replace(square_at(0.0, 0.0), covariance_m2=1e-6 * np.eye(8))
     (accuracy, *_) = check_goal(result(replace(FINE, score_tests=(focal,)), sure), 0.05, "poses")
     assert ("unless the focal length is off" in accuracy.says) is is_told
@@ -208,33 +208,33 @@ def test_stamps_that_jitter_explain_a_step_that_they_are_likelier_than_and_no_do
     step = replace(
         contradiction(table.STEP, ("front", "rear"), 0, "from 9.0 s on", -0.09, 0.012, 5.0), gain=23.0
     )
-    told = [f for f in check_inputs(replace(noisy, score_tests=(step,))) if f.status is not Status.PASS]
-    assert [(f.check, f.status) for f in told] == [("image stamps", Status.FAIL)], "the noise does harm"
+    findings = [f for f in check_inputs(replace(noisy, score_tests=(step,))) if f.status is not Status.PASS]
+    assert [(f.check, f.status) for f in findings] == [("image stamps", Status.FAIL)], "the noise does harm"
     scale = replace(contradiction(table.SCALE, ("front",), 0, "", -0.13, 0.025, 4.0), gain=13.5)
-    told = [f for f in check_inputs(replace(noisy, score_tests=(scale,))) if f.status is not Status.PASS]
-    assert [(f.check, f.status) for f in told] == [("image stamps", Status.WARN)]
+    findings = [f for f in check_inputs(replace(noisy, score_tests=(scale,))) if f.status is not Status.PASS]
+    assert [(f.check, f.status) for f in findings] == [("image stamps", Status.WARN)]
     assert doubted(replace(noisy, score_tests=(scale,))) is None, "nor does the headline doubt it"
     assert doubted(replace(FINE, score_tests=(scale,))) == scale
     clock = replace(contradiction(table.CLOCK, ("front",), 0, "", 0.03, 0.002, 12.0), gain=72.0)
-    told = [f for f in check_inputs(replace(noisy, score_tests=(clock,))) if f.status is not Status.PASS]
-    assert [f.check for f in told] == ["clock", "image stamps"], "what is likelier than them is told"
+    findings = [f for f in check_inputs(replace(noisy, score_tests=(clock,))) if f.status is not Status.PASS]
+    assert [f.check for f in findings] == ["clock", "image stamps"], "what is likelier than them is told"
 
 
 @pytest.mark.parametrize(("value", "is_told"), [(0.0019, True), (0.0005, False)])
 def test_an_error_is_doubted_by_how_probably_it_is_larger_than_what_matters(value, is_told):
     knock = contradiction(table.KNOCK, ("front",), 2, "from 9.0 s on", value, 0.0002, 5.4)
-    told = [f for f in check_inputs(replace(FINE, score_tests=(knock,))) if f.status is not Status.PASS]
-    assert [(f.check, f.status) for f in told] == [("mounting", Status.WARN)] * is_told
+    findings = [f for f in check_inputs(replace(FINE, score_tests=(knock,))) if f.status is not Status.PASS]
+    assert [(f.check, f.status) for f in findings] == [("mounting", Status.WARN)] * is_told
 
 
 def test_a_doubt_names_every_cause_that_is_nearly_as_likely():
     focal = contradiction(table.FOCAL, ("front",), 1, "", -0.0077, 0.0019, 3.6)
     principal = contradiction(table.PRINCIPAL, ("front", "rear"), 0, "", -13.0, 3.8, 3.1)
-    (told,) = [
+    (doubt,) = [
         f for f in check_inputs(replace(FINE, score_tests=(focal, principal))) if f.status is Status.WARN
     ]
-    assert "focal length fy of front is 0.8 % shorter" in told.says
-    assert "or the principal point of front and rear lies -13 px" in told.says
+    assert "focal length fy of front is 0.8 % shorter" in doubt.says
+    assert "or the principal point of front and rear lies -13 px" in doubt.says
 
 
 @pytest.mark.parametrize(("count", "is_told"), [(1, False), (2, True)])
@@ -244,9 +244,9 @@ def test_causes_each_of_which_is_unlikely_are_doubted_together(count, is_told):
         for camera in ("front", "rear")[:count]
     )
     assert 0.025 < probability_of_any(tests[:1]) < 0.05
-    told = [f for f in check_inputs(replace(FINE, score_tests=tests)) if f.status is not Status.PASS]
-    assert [(f.check, f.status) for f in told] == [("survey", Status.WARN)] * is_told
-    assert all("front" in f.says and "rear" in f.says for f in told)
+    findings = [f for f in check_inputs(replace(FINE, score_tests=tests)) if f.status is not Status.PASS]
+    assert [(f.check, f.status) for f in findings] == [("survey", Status.WARN)] * is_told
+    assert all("front" in f.says and "rear" in f.says for f in findings)
 
 
 @pytest.mark.parametrize("recorded", [Status.WARN, Status.FAIL])
@@ -300,8 +300,8 @@ def test_nothing_agrees_that_deviates_by_many_sigmas_however_rare_such_a_small_e
 
 def test_a_warning_states_the_limit_that_it_is_beyond():
     focal = contradiction(table.FOCAL, ("front",), 1, "", -0.0077, 0.0019, 3.6)
-    (told,) = [f for f in check_inputs(replace(FINE, score_tests=(focal,))) if f.status is Status.WARN]
-    assert told.limit < told.value
+    (warning,) = [f for f in check_inputs(replace(FINE, score_tests=(focal,))) if f.status is Status.WARN]
+    assert warning.limit < warning.value
 
 
 def test_a_straight_drive_says_what_it_cannot_tell():
@@ -353,9 +353,9 @@ def test_a_share_of_rejected_corners_is_judged_by_how_many_sightings_it_is_of(
     share, sightings, is_wrong, drive
 ):
     fit = replace(FIT, rejected_share=share, sightings=float(sightings))
-    found = raised(result(replace(FINE, fits={"front": fit})), drive)
-    assert set(found) == ({"rejected"} if is_wrong else set())
-    assert not is_wrong or found["rejected"].value > found["rejected"].limit
+    findings = raised(result(replace(FINE, fits={"front": fit})), drive)
+    assert set(findings) == ({"rejected"} if is_wrong else set())
+    assert not is_wrong or findings["rejected"].value > findings["rejected"].limit
 
 
 @pytest.mark.parametrize(
@@ -376,15 +376,15 @@ def test_rejected_corners_of_a_few_candidates_are_theirs_and_of_all_alike_the_ca
     count, contradicted = by_candidate.sum(axis=0)
     share = float(contradicted / count)
     fit = replace(FIT, rejected_share=share, sightings=float(count), by_candidate=by_candidate)
-    found = raised(result(replace(FINE, fits={"front": fit})), drive)
-    assert set(found) == ({"rejected"} if is_wrong else set())
+    findings = raised(result(replace(FINE, fits={"front": fit})), drive)
+    assert set(findings) == ({"rejected"} if is_wrong else set())
 
 
 def test_markings_that_overlap_are_told_with_a_place_and_neighbours_are_no_doubles(drive):
-    apart = [square_at(3.0 * n, 0.0) for n in range(12)]
-    found = raised(result(FINE, *apart, square_at(6.4, 0.2)), drive)
-    assert set(found) == {"double markings"}
-    assert "(6.5, 0.5)" in found["double markings"].says
+    squares = [square_at(3.0 * n, 0.0) for n in range(12)]
+    findings = raised(result(FINE, *squares, square_at(6.4, 0.2)), drive)
+    assert set(findings) == {"double markings"}
+    assert "(6.5, 0.5)" in findings["double markings"].says
     other = replace(square_at(0.4, 0.0), kind="stop_line")
     assert raised(result(FINE, square_at(0.0, 0.0), square_at(1.0, 0.0), other), drive) == {}
     for reason, is_told in (("odd shape", True), (LACKS_A_CORNER, False)):
@@ -407,16 +407,16 @@ def test_maps_of_two_cameras_that_are_apart_along_the_route_are_told(drive):
         "rear": result(FINE, *rear, cameras=("rear",), calibrations=calibrations),
     }
     together = result(FINE, *front, calibrations=calibrations, alone=alone)
-    found = [f for f in check_solution(drive, together) if f.status is not Status.PASS]
-    assert [f.check for f in found] == ["cameras apart"]
-    assert "30 cm ahead of where front does" in found[0].says
+    findings = [f for f in check_solution(drive, together) if f.status is not Status.PASS]
+    assert [f.check for f in findings] == ["cameras apart"]
+    assert "30 cm ahead of where front does" in findings[0].says
 
 
 def test_a_mounting_that_differs_alone_and_together_is_told(drive):
     alone = {"front": result(cameras=("front",), calibrations={"front": calibrated(0.2)})}
     together = result(calibrations={"front": calibrated(0.0)}, alone=alone)
-    found = [f.check for f in check_solution(drive, together) if f.status is not Status.PASS]
-    assert found == ["alone and together"]
+    checks = [f.check for f in check_solution(drive, together) if f.status is not Status.PASS]
+    assert checks == ["alone and together"]
 
 
 COUNT = 12

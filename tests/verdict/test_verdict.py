@@ -29,11 +29,11 @@ def test_the_verdict_is_that_of_the_worst_check():
 
 
 def test_what_passed_is_told_apart_from_what_was_raised():
-    told = Verdict.of([finding(Status.PASS, "heading"), finding(Status.WARN, "clock")]).as_json()
-    assert told["status"] == "WARN"
-    assert [one["check"] for one in told["findings"]] == ["clock"]
-    assert [one["check"] for one in told["passed"]] == ["heading"]
-    assert {"check", "value", "limit", "says", "about"} <= set(told["findings"][0])
+    verdict = Verdict.of([finding(Status.PASS, "heading"), finding(Status.WARN, "clock")]).as_json()
+    assert verdict["status"] == "WARN"
+    assert [entry["check"] for entry in verdict["findings"]] == ["clock"]
+    assert [entry["check"] for entry in verdict["passed"]] == ["heading"]
+    assert {"check", "value", "limit", "says", "about"} <= set(verdict["findings"][0])
 
 
 def test_the_terminal_shows_the_status_first_and_a_line_for_each_finding():
@@ -52,8 +52,8 @@ def test_a_check_that_the_drive_cannot_answer_is_told_apart_from_one_that_passed
 
 
 def test_what_several_cameras_have_in_common_is_one_line():
-    one = finding(Status.WARN)
-    lines = Verdict.of([one, replace(one, about="rear")]).lines
+    warning = finding(Status.WARN)
+    lines = Verdict.of([warning, replace(warning, about="rear")]).lines
     assert lines[1:] == ("WARN clock (front, rear): images are 118 ms late; mend the stamps",)
 
 
@@ -78,31 +78,33 @@ def test_a_yaw_from_north_is_told_once_although_the_ground_does_not_match_either
         reading=Reading.HEADING_FROM_PATH,
         shares={Reading.AS_GIVEN: 0.0, Reading.HEADING_FROM_PATH: 0.85},
     )
-    told = raised(input_findings(spoilt, {"front": ground}))
-    assert list(told) == ["heading"]
-    assert told["heading"].startswith("yaw counts clockwise from north")
+    findings = raised(input_findings(spoilt, {"front": ground}))
+    assert list(findings) == ["heading"]
+    assert findings["heading"].startswith("yaw counts clockwise from north")
 
 
 @pytest.mark.parametrize(
-    ("given", "kept"),
+    ("raised_checks", "causes_left"),
     [
         ("frozen images@front clock@front clock@rear", "frozen images@front clock@rear"),
         ("heading@poses ground match@front clock@rear", "heading@poses"),
     ],
     ids=["a cause in one camera hides nothing of another", "a cause in the poses hides all"],
 )
-def test_a_cause_hides_its_consequences(given, kept):
+def test_a_cause_hides_its_consequences(raised_checks, causes_left):
     def named(text):
-        return [tuple(one.split("@")) for one in re.findall(r"[a-z ]+@[a-z]+", text)]
+        return [tuple(words.split("@")) for words in re.findall(r"[a-z ]+@[a-z]+", text)]
 
-    findings = [of_check(check.strip(), about) for check, about in named(given)]
-    assert [(one.check, one.about) for one in causes(findings)] == [(c.strip(), a) for c, a in named(kept)]
+    findings = [of_check(check.strip(), about) for check, about in named(raised_checks)]
+    assert [(cause.check, cause.about) for cause in causes(findings)] == [
+        (c.strip(), a) for c, a in named(causes_left)
+    ]
 
 
 def test_a_cause_is_as_bad_as_its_worst_consequence_and_what_passed_hides_nothing():
     warned = of_check("square pixels", "front", Status.WARN)
-    (kept,) = causes([warned, of_check("ground residual", "front", Status.FAIL)])
-    assert (kept.check, kept.status) == ("square pixels", Status.FAIL)
+    (cause,) = causes([warned, of_check("ground residual", "front", Status.FAIL)])
+    assert (cause.check, cause.status) == ("square pixels", Status.FAIL)
     assert len(causes([of_check("heading", "poses", Status.PASS), of_check("clock", "rear")])) == 2
 
 
@@ -125,33 +127,33 @@ def test_a_drive_recorded_as_plane_and_a_long_grade_are_plane():
 @pytest.mark.parametrize(("grade", "status"), [(0.015, Status.WARN), (0.12, Status.FAIL)])
 def test_the_foot_of_a_ramp_is_told_with_its_place(grade, status):
     ramp = road(grade * np.maximum(np.arange(61.0) - 30, 0))
-    (found,) = check_road(replace(drive(poses()), road=ramp))
-    assert found.status is status
-    assert found.value == pytest.approx(np.rad2deg(grade), rel=0.2)
-    place_m = float(found.says.split(" m along")[0])
+    (ramp_finding,) = check_road(replace(drive(poses()), road=ramp))
+    assert ramp_finding.status is status
+    assert ramp_finding.value == pytest.approx(np.rad2deg(grade), rel=0.2)
+    place_m = float(ramp_finding.says.split(" m along")[0])
     assert 15 < place_m < 45
 
 
 @pytest.mark.parametrize("off_m", [0.0, 0.1, 0.6, 3.0])
 def test_heights_that_two_passes_contradict_are_named_with_their_place_but_not_another_storey(off_m):
-    there = np.column_stack([np.arange(61.0), np.zeros(61)])
-    back = there[::-1] + np.array([0.0, 1.0])
+    outward = np.column_stack([np.arange(61.0), np.zeros(61)])
+    back = outward[::-1] + np.array([0.0, 1.0])
     climb = np.tile([0.05, 0.0], (122, 1))
-    points = np.concatenate([there, back])
+    points = np.concatenate([outward, back])
     height = 46.2 + 0.05 * points[:, 0] + off_m * (points[:, 1] > 0) * (points[:, 0] > 30)
-    (found,) = check_heights(replace(drive(poses()), road=Road(points, height, climb)))
-    assert found.status is (Status.WARN if off_m == 0.6 else Status.PASS)
+    (height_finding,) = check_heights(replace(drive(poses()), road=Road(points, height, climb)))
+    assert height_finding.status is (Status.WARN if off_m == 0.6 else Status.PASS)
     if off_m == 0.6:
-        assert found.value == pytest.approx(0.6)
-        assert "the heights of two passes differ by 0.60 m" in found.says
-        assert int(found.says.split("at x ")[1].split(" m")[0]) > 30
+        assert height_finding.value == pytest.approx(0.6)
+        assert "the heights of two passes differ by 0.60 m" in height_finding.says
+        assert int(height_finding.says.split("at x ")[1].split(" m")[0]) > 30
 
 
 def written(folder, recorded):
     """A drive of one camera, an image every 2.5 m, in ``folder``."""
     (folder / "front/images").mkdir(parents=True)
-    seen = pictured(folder / "front/images", noisy, ".jpg", recorded)
-    write_drive(folder, replace(seen, name="tiny", root=folder), recorded)
+    pictures = pictured(folder / "front/images", noisy, ".jpg", recorded)
+    write_drive(folder, replace(pictures, name="tiny", root=folder), recorded)
     return folder
 
 

@@ -63,7 +63,7 @@ def lights(ground: np.ndarray, footage: Footage):
         cam_from_map = CALIBRATION.cam_from_vehicle @ inverse(image.map_from_vehicle)
         px_from_pixel = pinhole_px_from_ground(INFO.intrinsic, cam_from_map) @ east_from_pixel
         size = (INFO.width, INFO.height)
-        seen = cv2.warpPerspective(ground, px_from_pixel, size, flags=cv2.INTER_AREA, borderValue=ASPHALT)
-        return seen.astype(np.float32)
+        warped = cv2.warpPerspective(ground, px_from_pixel, size, flags=cv2.INTER_AREA, borderValue=ASPHALT)
+        return warped.astype(np.float32)
 
     return light

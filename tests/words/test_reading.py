@@ -25,7 +25,7 @@ def letters(text: str, sure: float = 0.98) -> Letters:
     """The network's output for a patch that reads so, and else of nothing."""
     alphabet = "\0" + "".join(sorted(set("0123456789EBH" + text)))
     columns = []
-    for letter in [letter for one in text for letter in ("\0", one)] or ["\0"]:
+    for letter in [letter for character in text for letter in ("\0", character)] or ["\0"]:
         probability = np.full(len(alphabet), (1.0 - sure) / (len(alphabet) - 1))
         probability[alphabet.index(letter)] = sure
         columns.append(np.log(probability))
@@ -42,8 +42,8 @@ def test_a_string_is_as_probable_as_all_the_columns_that_spell_it(text):
     probability = np.random.default_rng(3).dirichlet([1.0, 1.0, 1.0], size=5)
     total = 0.0
     for channels in product(range(3), repeat=5):
-        kept = [k for n, k in enumerate(channels) if n == 0 or k != channels[n - 1]]
-        if "".join(ALPHABET[k] for k in kept if k) == text:
+        letters_left = [k for n, k in enumerate(channels) if n == 0 or k != channels[n - 1]]
+        if "".join(ALPHABET[k] for k in letters_left if k) == text:
             total += np.prod(probability[range(5), channels])
     assert np.exp(Letters(np.log(probability), ALPHABET).log_of(text)) == pytest.approx(total)
 
@@ -72,9 +72,9 @@ def test_a_word_against_the_direction_of_driving_is_read_where_only_it_can_be_re
 
 
 def test_agreeing_readings_strengthen_and_contradicting_ones_weaken():
-    one, three = (reading_of([view("EBH", "", 0.99)] * count, ALONG).reading for count in (1, 3))
+    single, three = (reading_of([view("EBH", "", 0.99)] * count, ALONG).reading for count in (1, 3))
     mixed = reading_of([view("EBH", "", 0.99)] * 2 + [view("EB3", "", 0.99)], ALONG).reading
-    assert one.confidence < three.confidence
+    assert single.confidence < three.confidence
     assert (mixed.text, mixed.alternative) == ("EBH", "EB3")
     assert mixed.confidence < three.confidence
 

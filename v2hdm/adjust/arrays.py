@@ -67,7 +67,7 @@ class Arrays:
         corner: (K,) index of the corner, ascending.
         measured: (2, K) the observation at depth 1.
         root_information: (3, K) a, b, c of the whitened residual (a dx, b dx + c dy), dx at depth 1.
-        has_lines: whether some observations are of lines.
+        has_lines: whether some observations belong to lines.
         vehicle_from_map: (J, 4, 4) as recorded.
         session: (J,) session of each frame.
         states: column of the frame tangent of each state. An error with a drift beside its white part

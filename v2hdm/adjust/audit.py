@@ -93,7 +93,7 @@ def _audit_observations(arrays: Arrays, estimate: Estimate, focal_px: FloatArray
         is_same_side = behind == (expected.depth_m <= NEAR_M)
         if (agrees & is_same_side).all():
             return
-        # A descent that got lost says so by its status: what is finite for neither agrees.
+        # The status of a failed descent already reports it: values that are finite for neither agree.
         agrees |= ~(np.isfinite(squared) | np.isfinite(expected.distance))
         agrees &= is_same_side | (np.abs(expected.depth_m - NEAR_M) <= _ROUNDING)
     if not agrees.all():

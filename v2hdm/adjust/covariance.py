@@ -109,6 +109,10 @@ class Covariance:
         of_corners = np.empty((len(groups), 2 * groups.shape[1], 2 * groups.shape[1]))
         for part in self._parts(groups):
             of_corners[part] = self._corners(groups[part])
+        return self._with_held(of_corners, groups)
+
+    def _with_held(self, of_corners: FloatArray, groups: NDArray[np.int64]) -> FloatArray:
+        """Joint covariances (M, 2 n, 2 n) of groups (M, n) with the part of quantities held fixed."""
         if self.held is None:
             return of_corners
         moved = self.held.corners[groups].reshape(*of_corners.shape[:2], -1)

@@ -176,7 +176,7 @@ class _Search:
 
 
 _ANNEALING_TOLERANCE = 1e-3  # while a robust loss is being narrowed, more digits are wasted
-_ANNEALING_STEP = 3.0  # factor by which a robust loss is narrowed at least, from whitening to whitening
+_ANNEALING_STEP = 3.0  # least factor that narrows a robust loss from whitening to whitening
 _ITERATIONS_PER_WHITENING = 12  # most steps of LBFGS under one whitening
 RENEWAL = 2.0  # cost of a whitening, in evaluations, if frames have no states
 RENEWAL_WITH_STATES = 10.0  # cost of a whitening, in evaluations, if frames have states

@@ -173,7 +173,7 @@ class _Joined(NamedTuple):
 
 
 class _Moved(NamedTuple):
-    """Cameras at given unknowns, of which each has six and Q of its clock."""
+    """Cameras at given unknowns: six of its pose and Q of its clock for each camera."""
 
     cam_from_vehicle: Tensor  # (C, 4, 4)
     clock_s: Tensor  # (C, Q)

@@ -40,7 +40,7 @@ class _Columns(NamedTuple):
         return out
 
     def _rows(self, tile: int, tiles: tuple[int, ...]) -> Tensor:
-        """The rows of a column's part that are of some tiles, the first its own, and of the tip."""
+        """The rows of a column that lie in given tiles, its own first, and in the tip."""
         stacked = tile, *self.pattern.below[tile]
         part = self.parts[tile]
         if tiles == stacked:

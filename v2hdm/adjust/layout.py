@@ -225,7 +225,7 @@ class _Sorted(NamedTuple):
 
 
 def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
-    """The observations in order; AdjustError where two are of one corner in one image."""
+    """The observations in order; raises AdjustError if one image observes a corner twice."""
     from v2hdm.adjust.kernels.layout import Seen, arrange, lay_out
 
     columns = Seen.of(problem.observations.columns, problem.intrinsic)

@@ -39,11 +39,11 @@ POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
 """Axes of a frame's error, in the order of its tangent."""
 
 _LINE_RATIO = 1e3
-"""Ratio of an observation's variances from which it is of a line; a point's is below 200."""
+"""Least ratio of an observation's variances at which it belongs to a line; a point's is below 200."""
 
 # With the variances a > b: a b = det, a + b = trace, so a / b > q where trace^2 > det (q + 2 + 1 / q).
 LINE_EXCESS = _LINE_RATIO + 2 + 1 / _LINE_RATIO
-"""Squared trace over determinant of a covariance from which the observation is of a line."""
+"""Least squared trace over determinant of a covariance at which the observation belongs to a line."""
 
 _ROWS = 1 << 16
 """Observations that are looked at together: all at once would take 24 bytes each."""
@@ -114,7 +114,7 @@ class Drift:
 class ControlPoints:
     """M surveyed corners: ``corner`` (M,), ``points_map`` and ``sigma_m`` (M, 2).
 
-    Sigmas are of x and y, or along and across the directions ``along`` (M, 2); inf means unknown.
+    Sigmas apply to x and y, or along and across the directions ``along`` (M, 2); inf means unknown.
     """
 
     corner: IntArray

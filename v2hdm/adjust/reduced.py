@@ -321,7 +321,7 @@ class ReducedSystem:
     def _scatter(self, rows: Tensor, columns: Tensor, values: Tensor) -> None:
         """Add values (n, r, c) at rows (n, r), columns (n, c), mirrored to the lower triangle.
 
-        Rows of an item are of one tile, and so are columns.
+        The rows of an item lie in one tile, and so do its columns.
         """
         size = self.plan.size
         row_tile = rows[:, 0] // size

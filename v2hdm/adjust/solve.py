@@ -41,9 +41,7 @@ At ten degrees a first Newton step errs by a twentieth."""
 _CLOSE_GAP = 1e-2
 """Gap of a start up to which a few evaluations lead to the optimum, so that no nearer start pays. Chosen."""
 
-_WORTH_CORNERS = (
-    1000  # corners above which a coarse stage saves more evaluations of all corners than it costs
-)
+_WORTH_CORNERS = 1000  # least number of corners for a coarse stage: below, it costs more than it saves
 _NEARBY_CORNERS = 100  # corners of the coarse stage from nearby
 _CORNERS = 400  # corners of each coarse stage from afar
 _BLOCKS = 10  # stretches of the route from which the coarse stage takes its corners
@@ -210,7 +208,7 @@ def _start(problem: Problem, engine: TorchEngine, robust: Loss, options: SolveOp
 def _nearer(
     problem: Problem, engine: TorchEngine, robust: Loss, estimate: Estimate, opening: Whitening
 ) -> Start:
-    """The start with the cameras where a Newton step leads, if that is nearer to the optimum.
+    """The start with its cameras moved by a Newton step, if that is nearer to the optimum.
 
     Corners are back-projected anew, and so follow the cameras exactly: by the step itself they would to first
     order. Of 4,000 observations that saves three of six evaluations, with frame states four of fourteen.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from v2hdm.asbuilt.design import (
     BuiltShape,
     Design,
     DesignShape,
-    Outline,
     built_shapes,
     check_place,
     check_shapes,
@@ -60,12 +60,12 @@ class Comparison:
     misfit: Misfit | None  # None where too little is found to tell
 
     def count(self, fate: Fate) -> int:
-        """How many findings are of that fate."""
+        """The number of findings with that fate."""
         return sum(finding.fate is fate for finding in self.findings)
 
     @property
     def conforms(self) -> bool:
-        """Whether nothing is off, missing or extra, and the design as a whole lies where it should."""
+        """Whether nothing is off, missing or extra, and the whole design is in place."""
         wrong = (Fate.OFF, Fate.MISSING, Fate.EXTRA)
         is_moved = self.misfit is not None and self.misfit.is_significant
         return not is_moved and not any(finding.fate in wrong for finding in self.findings)
@@ -105,10 +105,13 @@ def compare_with_design(
     places = meant[pairs.shape].mean(axis=1)
     misfit = find_misfit(corners[pairs.marking].mean(axis=1), places, errors, start)
     placed = start.apply(meant) if misfit.is_significant else meant
-    findings = [
-        _judged(pairs, k, design.shapes, outlines, placed, built, errors, misfit, tolerance)
-        for k in range(len(pairs.shape))
-    ]
+    findings = []
+    for k, number in enumerate(pairs.shape.tolist()):
+        marking = built[pairs.marking[k]]
+        has_size = marking.has_size and outlines[number].has_size
+        pair = _Pair(design.shapes[number], placed[number], marking, int(pairs.turn[k]), has_size)
+        covariance_m2 = errors.own_m2[k] + SHIFT @ misfit.common_m2[k] @ SHIFT.T
+        findings.append(_judged(pair, marking.corners_map - misfit.common_m[k], covariance_m2, tolerance))
     findings += _missing(pairs, design.shapes, placed, built, mosaic)
     extra = sorted(set(range(len(built))) - set(pairs.marking.tolist()))
     findings += [_extra(built[number]) for number in extra if _is_designed(built[number], kinds)]
@@ -123,30 +126,27 @@ def _errors_of(shapes: Sequence[BuiltShape], over_m: float) -> Errors:
     return Errors.of(markings, over_m)
 
 
+class _Pair(NamedTuple):
+    """A shape of the design, its corners (4, 2) in the map, and the marking that was painted for it."""
+
+    shape: DesignShape
+    meant_map: FloatArray
+    marking: BuiltShape
+    turn: int
+    has_size: bool
+
+
 def _judged(
-    pairs: Pairs,
-    k: int,
-    shapes: Sequence[DesignShape],
-    outlines: Sequence[Outline],
-    placed: FloatArray,
-    built: Sequence[BuiltShape],
-    errors: Errors,
-    misfit: Misfit,
-    tolerance: Tolerances,
+    pair: _Pair, corners_map: FloatArray, covariance_m2: FloatArray, tolerance: Tolerances
 ) -> Finding:
-    """The finding on the pair of number ``k``."""
-    number = int(pairs.shape[k])
-    marking = built[pairs.marking[k]]
-    corners_map = marking.corners_map - misfit.common_m[k]
-    covariance = errors.own_m2[k] + SHIFT @ misfit.common_m2[k] @ SHIFT.T
-    has_size = marking.has_size and outlines[number].has_size
-    result = judge(placed[number], corners_map, covariance, int(pairs.turn[k]), tolerance, has_size)
+    """The finding on a pair; the marking's corners (4, 2) are without the error that it shares."""
+    result = judge(pair.meant_map, corners_map, covariance_m2, pair.turn, tolerance, pair.has_size)
     return Finding(
         fate=decided(result.probability),
-        kind=marking.kind,
-        name=shapes[number].name,
-        id=marking.id,
-        meant_map=placed[number],
+        kind=pair.marking.kind,
+        name=pair.shape.name,
+        id=pair.marking.id,
+        meant_map=pair.meant_map,
         found_map=corners_map,
         probability=result.probability,
         quantities=result.quantities,
@@ -191,7 +191,7 @@ def _extra(shape: BuiltShape) -> Finding:
 
 
 def _is_designed(shape: BuiltShape, kinds: Sequence[str | None]) -> bool:
-    """Whether the design has shapes of this class, so that one more is not meant."""
+    """Whether the design has shapes of this class, which makes this one extra."""
     return None in kinds or shape.kind in kinds
 
 

@@ -26,7 +26,7 @@ from v2hdm.records import (
 
 @dataclass(frozen=True)
 class DesignShape:
-    """A piece of paint as it is meant to be: a closed ``outline_map`` (N, 2), m, counter-clockwise."""
+    """A piece of paint in the design: a closed ``outline_map`` (N, 2), m, counter-clockwise."""
 
     name: str  # of its feature in the file
     kind: str | None  # class, None where the file does not tell
@@ -35,7 +35,7 @@ class DesignShape:
 
 @dataclass(frozen=True)
 class Design:
-    """The shapes of a design in the frame of the map that it is compared with, and where they are from."""
+    """The shapes of a design in the frame of the map, and their source."""
 
     shapes: tuple[DesignShape, ...]
     source: str = "the design"
@@ -158,7 +158,7 @@ _LEAST_AREA_M2 = 1e-4  # least area of a shape, m^2: a centimetre squared
 def check_place(places: FloatArray, others: FloatArray, source: str, called: str) -> None:
     """Raise MapFileError where all ``places`` (N, 2) of a source lie far from ``others`` (M, 2), m.
 
-    ``called`` is what the others are. The message says so where swapped axes explain it.
+    ``called`` names the others. The message names swapped axes where they explain it.
     """
     low = others.min(axis=0)
     high = others.max(axis=0)

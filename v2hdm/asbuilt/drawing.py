@@ -52,7 +52,7 @@ class Area(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """The areas of a drawing, its unit, and what it has besides."""
+    """The areas of a drawing, its unit, and the count of other entities."""
 
     areas: list[Area]
     unit: str  # one of UNITS_M
@@ -70,14 +70,14 @@ class _Placed(NamedTuple):
 
 
 def read_drawing(path: Path, unit: str | None) -> Drawing:
-    """Read the areas of a DXF file, whose ``unit`` counts before the one that it states.
+    """Read the areas of a DXF file; ``unit`` overrides the one that the file states.
 
     Raises MapFileError for a damaged file, ConfigError where the unit is unknown or not stated.
     """
     ezdxf = need("ezdxf", "gis", "designs in DXF", ConfigError)
     note_input(path)
     if unit is not None and unit not in UNITS_M:
-        raise ConfigError(f"--unit {shown(unit)}: is no unit of a drawing; give {', '.join(UNITS_M)}")
+        raise ConfigError(f"--unit {shown(unit)}: is not a unit of a drawing; give {', '.join(UNITS_M)}")
     try:
         document = ezdxf.readfile(path)
         stated_crs = document.header.custom_vars.get("crs") if document.header.custom_vars else None
@@ -86,7 +86,7 @@ def read_drawing(path: Path, unit: str | None) -> Drawing:
     except (ezdxf.DXFError, OSError, ValueError, TypeError, UnicodeError, RecursionError) as failure:
         # What is no DXF file at all is an OSError, too.
         reason = getattr(failure, "strerror", None) or failure
-        raise MapFileError(f"{path}: is no drawing that can be read ({reason}); check the file") from None
+        raise MapFileError(f"{path}: is not a readable drawing ({reason}); check the file") from None
     if len(placed) > _MOST_ENTITIES:
         raise MapFileError(
             f"{path}: has more than {_MOST_ENTITIES} entities with its blocks; give the markings only"
@@ -189,7 +189,7 @@ def _ring(drawn: Any, chord: float) -> FloatArray:
 
 
 def _wide(entity: Any, kind: str, points: FloatArray) -> list[FloatArray]:
-    """The outline of a straight polyline that is drawn with a width, as dashes of paint are."""
+    """The outline of a straight polyline with a width, such as a dash of paint."""
     if len(points) != 2 or kind not in ("LWPOLYLINE", "POLYLINE"):
         return []
     if kind == "LWPOLYLINE":

@@ -66,7 +66,7 @@ class Mosaic:
 
 
 def read_mosaic(folder: Path) -> Mosaic | None:
-    """The mosaic of a folder of results, None where it has none; MapFileError if its extent is damaged."""
+    """The mosaic of a result folder, or None; raises MapFileError if its extent is damaged."""
     extent = folder / MOSAIC_EXTENT
     picture = folder / MOSAIC_PICTURE
     if not extent.is_file() or not picture.is_file():

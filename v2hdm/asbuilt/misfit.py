@@ -47,7 +47,7 @@ class Misfit:
 def find_misfit(built: FloatArray, design: FloatArray, errors: Errors, start: Motion) -> Misfit:
     """The misfit of P markings with centres ``built`` (P, 2) and places in the design (P, 2), m.
 
-    ``start`` is the motion of the design by which they were paired.
+    ``start`` is the motion of the design that paired them.
     """
     off_m = built - start.apply(design)
     motions = _motions(start.apply(design) - start.apply(start.about_map))

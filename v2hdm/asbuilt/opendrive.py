@@ -16,7 +16,7 @@ from v2hdm.store.files import read_text
 _SAME_PLACE_M = 1e-6  # distance, m, of a last corner that repeats the first
 _PAINT_M = 0.1  # largest height, m, of an object that may be paint: posts and barriers are higher; chosen
 _MOST_REPEATED = 100_000  # repetitions of an object; a road of 100 km has fewer dashes
-_STEP_M = 0.05  # step, m, by which a spiral is integrated: it is exact to a micrometre in bends of roads
+_STEP_M = 0.05  # integration step of a spiral, m: exact to a micrometre in bends of roads
 
 
 class ObjectOutline(NamedTuple):
@@ -69,7 +69,7 @@ class Piece:
                 self.start.beside(np.array([[along_m, across]]))[0], self.start.heading_rad + float(heading)
             )
         if kind not in ("line", "arc", "spiral"):
-            raise MapFileError(f"a geometry {kind} is none of OpenDRIVE's; fix the file")
+            raise MapFileError(f"a geometry {kind} is unknown to OpenDRIVE; fix the file")
         begin = number_in(self.shape, "curvature" if kind == "arc" else "curvStart", 0.0)
         end = number_in(self.shape, "curvature" if kind == "arc" else "curvEnd", begin)
         steps = 1 if kind == "line" else max(1, int(np.ceil(abs(along_m) / _STEP_M)))
@@ -90,16 +90,16 @@ class Piece:
 
 
 def read_root(path: Path) -> ET.Element:
-    """The root of an OpenDRIVE file; MapFileError where it is none."""
+    """The root of an OpenDRIVE file; raises MapFileError for other files."""
     text = read_text(path, MapFileError)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise MapFileError(f"{path}: declares a document type, which OpenDRIVE has not; take it out")
     try:
         root = ET.fromstring(text.encode())
     except (ET.ParseError, ValueError) as failure:
-        raise MapFileError(f"{path}: is no XML that can be read ({failure}); save it again") from None
+        raise MapFileError(f"{path}: is not readable XML ({failure}); save it again") from None
     if root.tag != "OpenDRIVE":
-        raise MapFileError(f"{path}: is no OpenDRIVE file (its root is {root.tag[:40]}); give one")
+        raise MapFileError(f"{path}: is not an OpenDRIVE file (its root is {root.tag[:40]}); give one")
     return root
 
 
@@ -184,7 +184,7 @@ class _Instance(NamedTuple):
 
 
 def _instances(entry: ET.Element) -> list[_Instance]:
-    """The object itself, or its repetitions; none of what it is along the whole road, such as a barrier."""
+    """The object itself, or its repetitions; nothing for one along the whole road, such as a barrier."""
     size_m = (number_in(entry, "length", 0.0), number_in(entry, "width", 0.0))
     repeats = entry.findall("repeat")
     if not repeats:

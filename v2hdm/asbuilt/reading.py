@@ -43,7 +43,7 @@ _NAMED_BY = ("class", "kind", "type", "layer", "name")  # properties that say wh
 
 @dataclass(frozen=True)
 class Source:
-    """How a file is meant, as far as it does not say.
+    """The interpretation of a file where the file does not state it.
 
     Attributes:
         crs: the system of its coordinates, such as EPSG:25832, or local for the map's own frame.
@@ -88,7 +88,7 @@ def read_design(path: Path, hd_map: HDMap, source: Source | None = None) -> Desi
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         endings = ", ".join(_READERS)
-        raise MapFileError(f"{path}: is no design that can be read; give a file that ends in {endings}")
+        raise MapFileError(f"{path}: is not a readable design; give a file that ends in {endings}")
     if _is_ours(path):
         return design_of_map(read_map(path)[0], origin, str(path))
     content = reader(path, source)
@@ -132,12 +132,12 @@ def _is_ours(path: Path) -> bool:
 def of_known_kinds(
     shapes: Iterable[Drawn], classes: Collection[str], source: Source, path: Path
 ) -> list[tuple[Drawn, str | None]]:
-    """Shapes with their classes; those with names of no class are left out, with one line that says so."""
+    """Shapes with their classes; shapes whose names match no class are left out, with one warning line."""
     stated_kinds = source.kinds or {}
     for name, stated in stated_kinds.items():
         if stated not in classes:
             choices = ", ".join(sorted(classes))
-            raise ConfigError(f"--class {name}={shown(stated)}: is no class; choose from: {choices}")
+            raise ConfigError(f"--class {name}={shown(stated)}: is not a class; choose from: {choices}")
     meant = {_plain(name): stated for name, stated in stated_kinds.items()}
     out: list[tuple[Drawn, str | None]] = []
     unknown = dict[str, int]()
@@ -150,7 +150,7 @@ def of_known_kinds(
             out.append((shape, kind))
     if unknown:
         named = ", ".join(f"{shown(name)} ({count})" for name, count in list(unknown.items())[:_MOST_NAMED])
-        line = f"{path}: left out, for they are no classes: {named}; --class NAME=CLASS says what they are"
+        line = f"{path}: left out shapes of unknown classes: {named}; --class NAME=CLASS names their class"
         if not out:
             raise MapFileError(line)
         _log.warning(line)
@@ -182,7 +182,7 @@ def in_map(positions: FloatArray, crs: str, origin: GeodeticOrigin | None, where
     if geodetic.is_geographic(crs, where, MapFileError):
         if np.abs(positions[:, 1]).max() > 90 or np.abs(positions[:, 0]).max() > 180:
             raise MapFileError(
-                f"{where}: {positions[0, 0]:g}, {positions[0, 1]:g} is no longitude and latitude; are its "
+                f"{where}: {positions[0, 0]:g}, {positions[0, 1]:g} is not a longitude and latitude; are its "
                 "axes swapped, or is it in another system (--crs)?"
             )
         on_earth = np.column_stack([positions[:, ::-1], height_m])
@@ -218,7 +218,7 @@ def _of_features(
 def _read_geojson(path: Path, source: Source) -> _File:
     content = load_json(path, MapFileError)
     if not isinstance(content.get("features"), list):
-        raise MapFileError(f"{path}: is no collection of features; give one")
+        raise MapFileError(f"{path}: is not a collection of features; give one")
     features = []
     for number, feature in enumerate(content["features"]):
         where = f"{path}: feature {number}"
@@ -264,7 +264,7 @@ def _read_geopackage(path: Path, source: Source) -> _File:
         files.append(_of_features(features, authority if system.get("srs_id", 0) > 0 else None))
     systems_used = {file.crs for file in files if file.shapes}
     if len(systems_used) > 1 and source.crs is None:
-        raise MapFileError(f"{path}: its layers are of several systems; give one with one system")
+        raise MapFileError(f"{path}: its layers use several coordinate systems; give a file that uses one")
     shapes = [shape for file in files for shape in file.shapes]
     return _File(shapes, next(iter(systems_used), None), sum(file.lines for file in files))
 

@@ -21,7 +21,7 @@ from v2hdm.records import FloatArray, IntArray
 _FARTHEST_M = 30.0  # largest shift of a whole design, m, that is looked for; chosen
 _BIN_M = 0.5  # width of the cells in which shifts are counted, m
 _NEAR_M = 0.5  # distance, m, of a shape from its marking up to which it speaks for a motion of the whole
-_TRIED = 12  # shifts that are tried: the ones that the most pairs name
+_TRIED = 12  # number of shifts to try: those that most pairs suggest
 _ROUNDS = 8  # of pairing and fitting, from each shift
 _FEWEST = 3  # pairs that a motion of the whole is fitted to
 _SHIFT_SIGMA_M = 10.0  # prior standard deviation of a shift, m: of two that fit alike the smaller one counts

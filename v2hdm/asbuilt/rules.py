@@ -42,7 +42,7 @@ _BROKEN = 3.0  # times the usual spacing of a class beyond which a row has ended
 
 
 class Rule(NamedTuple):
-    """A rule on a ``quantity`` of a class, in ``unit``, with its limits and where it is from."""
+    """A rule on a ``quantity`` of a class, in ``unit``, with its limits and its place in the file."""
 
     kind: str
     quantity: str
@@ -136,7 +136,7 @@ def _rule(cell_of: Mapping[str, str], kinds: Sequence[str], where: str) -> Rule:
     quantity = cell_of["quantity"]
     unit = cell_of["unit"]
     if kind not in kinds:
-        raise MapFileError(f"{where}: {shown(kind)} is no class; choose from: {', '.join(sorted(kinds))}")
+        raise MapFileError(f"{where}: {shown(kind)} is not a class; choose from: {', '.join(sorted(kinds))}")
     if quantity not in _MEASURES:
         raise MapFileError(
             f"{where}: unknown quantity {shown(quantity)}; choose from: {', '.join(_MEASURES)}"

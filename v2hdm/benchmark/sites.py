@@ -85,7 +85,7 @@ def site_of(name: str, way: Path | None = None) -> Site:
             f"--way: is for a layout of your own; give SITE as an OpenDRIVE file (.xodr), not {name}"
         )
     if name not in sites:
-        raise ConfigError(f"{shown(name)}: is no site of the benchmark; choose from {', '.join(sites)}")
+        raise ConfigError(f"{shown(name)}: is not a site of the benchmark; choose from {', '.join(sites)}")
     return sites[name]
 
 

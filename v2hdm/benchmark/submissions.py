@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 VERDICTS = ("PASS", "WARN", "FAIL")
 
-_SWAPPED = 2.0  # factor by which more markings must match with swapped axes to call them swapped; chosen
+_SWAPPED = 2.0  # swapped axes must match this many times more markings to be reported as swapped; chosen
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def read_content(path: Path) -> Mapping[str, Any]:
     if not path.exists():
         raise MapFileError(f"{path}: no such file; give a map as GeoJSON, or the result folder of v2hdm map")
     if path.suffix.lower() not in (".geojson", ".json"):
-        raise MapFileError(f"{path}: is no GeoJSON; give a file that ends in .geojson")
+        raise MapFileError(f"{path}: is not a GeoJSON file; give one that ends in .geojson")
     return load_json(path, MapFileError)
 
 
@@ -94,7 +94,7 @@ def _foreign(content: Mapping[str, Any], true_map: HDMap, source: Source, path: 
     """A map of another tool."""
     features = content.get("features")
     if not isinstance(features, list):
-        raise MapFileError(f"{path}: is no collection of features; give one")
+        raise MapFileError(f"{path}: is not a collection of features; give one")
     crs = source.crs or crs_of_geojson(content)
     polygons, lines = _drawn(features, path)
     classes = classes_of(true_map)
@@ -153,7 +153,9 @@ def _marking(drawn: Drawn, kind: str, outline_map: FloatArray, path: Path) -> Ma
     if covariance_m2 is None and sigma_m is not None:
         sigma_m = take_number(sigma_m, f"{where}, sigma_m", MapFileError)
         if sigma_m <= 0:
-            raise MapFileError(f"{where}, sigma_m: {sigma_m:g} m is no standard deviation; give more than 0")
+            raise MapFileError(
+                f"{where}, sigma_m: {sigma_m:g} m is not a standard deviation; give more than 0"
+            )
         covariance_m2 = sigma_m**2 * np.eye(8)
     return Marking(kind, corners_map, 1, covariance_m2)
 
@@ -173,7 +175,7 @@ def _verdict(stated: object, path: Path) -> str | None:
     status = stated.get("status") if isinstance(stated, Mapping) else stated
     if status is None or status in VERDICTS:
         return status
-    raise MapFileError(f"{path}: its verdict is none of {', '.join(VERDICTS)}; fix or drop it")
+    raise MapFileError(f"{path}: its verdict is not one of {', '.join(VERDICTS)}; fix or drop it")
 
 
 def _check(hd_map: HDMap, true_map: HDMap, path: Path) -> None:

@@ -83,7 +83,7 @@ def movement(before: Calibration, after: Calibration) -> Movement:
 
 
 def turned_alike(movements: Sequence[Movement]) -> bool:
-    """Whether several cameras have moved, all by the same turn: then it is no camera that has moved."""
+    """Whether several cameras turned alike: then the heading changed, not the cameras."""
     if len(movements) < 2 or not all(movement.moved for movement in movements):
         return False
     first = movements[0]

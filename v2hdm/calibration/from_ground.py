@@ -107,7 +107,7 @@ def summary_lines(calibrated: GroundCalibration) -> list[str]:
 
 
 def _lines(estimate: GroundEstimate) -> Iterator[str]:
-    """The estimate for a terminal: a line of figures, and one for each quantity that is not observable."""
+    """The estimate for a terminal: a line of figures, and a line for each unobservable quantity."""
     calibration = estimate.calibration
     if calibration is None or calibration.covariance is None:
         reading = estimate.reading

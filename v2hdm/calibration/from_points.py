@@ -171,7 +171,7 @@ def _height_m(fit: Fit) -> float:
 
 
 def _doubtful(fits: list[Fit]) -> bool:
-    """Whether the points explain no mounting well, so that other readings of the table are worth a look."""
+    """Whether no mounting explains the points well, so that other readings of the table should be tried."""
     if not fits:
         return True
     right = int(fits[0].is_right.sum())

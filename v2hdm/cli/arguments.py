@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
     """Add the arguments of commands that read a drive; ``result`` ends the name of the default folder."""
     parser.add_argument("drive", type=Path, help="a drive folder or a bag; see docs/drive-format.md")
-    parser.add_argument("--camera", action="append", default=[], metavar="NAME", help="only this; repeatable")
+    parser.add_argument(
+        "--camera", action="append", default=[], metavar="NAME", help="use only this camera; repeatable"
+    )
     parser.add_argument("--format", default="auto", metavar="NAME", help="folder, kitti, bag (default: auto)")
     parser.add_argument("--output", type=Path, metavar="DIR", help=f"default: outputs/<drive>-{result}")
     parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: all cores)")
@@ -45,12 +47,12 @@ def drive_of(parsed: argparse.Namespace) -> Drive:
 
 
 def log_to_terminal() -> None:
-    """Show warnings, and what reading a drive takes and decides, on stderr."""
+    """Show warnings, and the choices of the drive's reader, on stderr."""
     terminal = logging.StreamHandler()
     terminal.setFormatter(logging.Formatter("%(message)s"))
     terminal.addFilter(_Once())
     logging.basicConfig(handlers=[terminal])
-    logging.getLogger("v2hdm.io").setLevel(logging.INFO)  # an import may take minutes, and says so
+    logging.getLogger("v2hdm.io").setLevel(logging.INFO)  # an import may take minutes and logs its progress
 
 
 class _Once(logging.Filter):

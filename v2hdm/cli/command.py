@@ -42,6 +42,9 @@ class Command:
         # OpenMP's threads sleep while they wait for each other. Spinning, they hold up those that they wait
         # for as soon as the machine is busy otherwise. Libraries read this when they are loaded.
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        # Matrices are small here, and OpenBLAS's threads spin after each product, whatever that says:
+        # they took 20 of 48 s of CPU of the adjustment of a port, and held up those that had work.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         try:
             from v2hdm.store.inputs import protected_inputs
 

@@ -115,7 +115,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _overview(text: Callable[[], str]) -> int:
-    """Print what ``v2hdm`` says without a command; returns the exit code."""
+    """Print the overview of ``v2hdm`` without a command; returns the exit code."""
     return Command("v2hdm", "List the commands.", lambda _: print(text()), None, "interrupted")(())
 
 

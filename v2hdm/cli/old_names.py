@@ -45,7 +45,7 @@ def renamed_overrides(overrides: Sequence[str]) -> list[str]:
 
 
 def renamed_file(path: Path) -> str | None:
-    """The text of a run file by the names of now; None where it has no old ones."""
+    """The text of a run file with today's names; None if it has no old names."""
     content = read_yaml(path, ConfigError)
     if not isinstance(content, dict):
         return None

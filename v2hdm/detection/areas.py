@@ -36,7 +36,7 @@ of their height apart, words two thirds or more (DIN 1451-3, FHWA Series D)."""
 _GAP_OF_CUT = 0.5  # the same for a piece that the image cuts: its extent is larger than what is seen
 _MOST_GAP_M = {TEXT: 1.0}  # largest gap by class, m: lines of letters of 4 m are as far apart
 _OTHER_GAP_M = 2.0  # largest gap in any other area, m: hatching is 1 to 2 m apart
-_MOST_POINTS = 80  # points of an outline, evenly along it, by which gaps are measured
+_MOST_POINTS = 80  # number of points, evenly along an outline, that measure gaps
 _CUT_PX = 6.0  # distance from where the image or its road begins, px, within which an outline may be cut
 
 
@@ -122,7 +122,7 @@ def in_company(words: Sequence[MarkingDetection], camera: RoadCamera) -> list[Ma
 
 
 def _named_together(names: Sequence[str]) -> list[tuple[str, ...]]:
-    """The classes of areas; those of which a piece may show both to the network are together."""
+    """The classes of areas, in groups that the network may confuse within one piece."""
     written = (TEXT, BOX) if {TEXT, BOX} <= set(names) else ()
     return [*([written] if written else []), *((name,) for name in names if name not in written)]
 

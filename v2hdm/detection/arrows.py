@@ -20,7 +20,7 @@ FEATURES = ("short", "standing")
 """Log of the length over the least usual one where it is less; :meth:`RoadCamera.standing` of that side."""
 
 _USUAL_LENGTH_M = 2.0  # of the shortest arrows of standards less what an outline loses, m
-_OUTLINE_PX = 2.0  # by which an outline may be too short, a px at either end
+_OUTLINE_PX = 2.0  # an outline may be this much too short, px: one at either end
 
 FITTED = (6.01, -3.59)
 """Weights of the features, fitted to photographs and renders by ``python -m train.fit_arrows``."""

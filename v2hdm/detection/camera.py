@@ -79,7 +79,7 @@ class Lens:
 
 
 class RoadCamera:
-    """One camera with fast lens and ground mappings, and the rows worth looking at.
+    """One camera with fast lens and ground mappings, and the image rows to search.
 
     Recorded pixels are those of the image, pinhole pixels those without distortion; points far from any lens
     singularity are assumed. ``top`` is the first image row below the horizon of the initial IPM, with a
@@ -400,7 +400,7 @@ def rough_calibration(
     fov_deg: float,
     roll_deg: float = 0.0,
 ) -> Calibration:
-    """A pinhole camera that looks straight ahead, for images of which nothing better is known.
+    """A pinhole camera that looks straight ahead, for images without a calibration.
 
     ``pitch_deg`` is below the horizon, ``fov_deg`` horizontal; ``roll_deg`` turns the image's right side
     down, on which the horizon then rises.

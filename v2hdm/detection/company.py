@@ -22,8 +22,8 @@ many are not, and how probable is the surest. Of dashes also: how probable is th
 its line after a gap; 0 for other classes.
 """
 
-LEAST_SIZE_M = 0.01  # least length or width of a marking on the ground that is told from smaller ones, m
-MOST_SIZE_M = 100.0  # largest length or width that is told from larger ones, m
+LEAST_SIZE_M = 0.01  # lengths and widths of markings on the ground are clipped from below at this, m
+MOST_SIZE_M = 100.0  # lengths and widths on the ground are clipped from above at this, m
 
 _MOST = 3.0  # more company than this many markings adds nothing
 _APART_M = 0.3  # quadrilaterals whose middles are nearer than this are readings of the same paint, m

@@ -75,7 +75,7 @@ class Detector:
     @classmethod
     @checked
     def load(cls, path: str | Path | None = None, options: DetectorOptions | None = None) -> Detector:
-        """Load a model: ``path``, else ``options.model``, else the one that is shipped.
+        """Load a model: ``path``, else ``options.model``, else the shipped one.
 
         Raises DetectorError where the model cannot be used, or the shipped files do not belong together.
         """
@@ -101,7 +101,7 @@ class Detector:
     def detect_in(
         self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
-        """Find the markings and lanes of an image of which the network's output is known."""
+        """Find the markings and lanes of an image from the network's output."""
         looked = last(self.steps_in(output, image_bgr, camera, has_boundaries))
         return looked.markings, looked.lanes
 
@@ -114,7 +114,7 @@ class Detector:
     def steps_in(
         self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> Steps[Looked]:
-        """As :meth:`steps`, of an image of which the network's output is known."""
+        """As :meth:`steps`, from the network's output on the image."""
         with lap("propose"):
             proposals = self.propose(output, camera)
         yield
@@ -154,7 +154,7 @@ class Detector:
             return tuple(find_markings(readings, proposals.camera, self.options))
 
     def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
-        """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`.
+        """Run the network on an image, without the vehicle's own parts; raises as :meth:`detect`.
 
         It looks from the row ``top`` on, see :func:`v2hdm.detection.network.run_on_road`.
         """
@@ -192,7 +192,7 @@ class Detector:
         )
 
     def lane_pieces(self, proposals: Proposals) -> list[LaneDetection]:
-        """Centre lines of what the network takes for the paint of lanes."""
+        """Centre lines of the lane paint that the network finds."""
         lane_classes = set(self.catalogue.lane_paint)
         paint = [
             (piece, score)
@@ -285,7 +285,7 @@ def _in_regions(pieces: Sequence[Proposal], regions_px: FloatArray) -> list[Prop
 
 
 def _without_vehicle(output: NetworkOutput, camera: Camera) -> NetworkOutput:
-    """The network's output on an image, less what shows the vehicle."""
+    """The network's output on an image, without the vehicle's own parts."""
     mask = camera.own_vehicle
     if mask is None:
         return output

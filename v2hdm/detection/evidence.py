@@ -58,7 +58,7 @@ _INNER_ALONG = np.tile(_GRID, 6)  # places (36,) all over a marking, in parts of
 _INNER_ACROSS = np.repeat(_GRID, 6)  # the same places, in parts of its width
 _SUREST = -4  # place of the ninth decile among the 36 places inside, in order
 _BESIDE_PX = 2.5  # distance outside a side, px, at which paint beside it is looked for
-_LEAST_WIDTH_PX = 0.3  # least width of a marking in the image that is told from smaller ones, px
+_LEAST_WIDTH_PX = 0.3  # widths of markings in the image are clipped at this, px
 _MOST_SKEW = 2.0  # log of how much longer the longest side is than the shortest, from which all are alike
 
 

@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 _MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
 _POLL_S = 0.005  # a folder that grows is looked at this often
 _WRITTEN_S = 1.0  # an image is written within this time
-_LAST_FRAMES = 10  # frames by which the pace of a camera is known
+_LAST_FRAMES = 10  # number of frames that determine a camera's rate
 _OVERDUE = 1.5  # intervals without a frame after which nobody knows when the next one comes
 _SAME_DATE_S = (2.0, 0.05)
 """Seconds within which two changes may have one date: of dates in whole seconds (FAT), and in fractions."""

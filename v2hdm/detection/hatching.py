@@ -42,6 +42,6 @@ def meshes(rows: IntArray, columns: IntArray, is_painted: BoolArray) -> float:
 
 
 def box_probability(text_cells: float, box_cells: float, netted: float, weight: float = FITTED) -> float:
-    """The probability that paint is of a box, by the sums of either class's probability and its meshes."""
+    """The probability that paint belongs to a box, from both classes' summed probability and its meshes."""
     named = np.log((box_cells + _PRIOR_CELLS) / (text_cells + _PRIOR_CELLS))
     return float(1.0 / (1.0 + np.exp(-named - weight * netted)))

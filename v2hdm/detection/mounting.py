@@ -21,19 +21,19 @@ from v2hdm.detection.network import AnchorRow, Network, NetworkOutput, anchor_ro
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 
-_SCALE = 2  # factor by which an image is reduced: a sixth of the time, and a third less certain
+_SCALE = 2  # reduction of an image: a sixth of the time, and a third less certain
 _LEAST_CROSSINGS = 4  # least number of crossings that are a line
 _LEAST_EDGE_PX = 6.0  # least length of a paint's edge, in elements of the paint
 _EDGE_SIGMA_PX = 0.45  # standard deviation of the ends of a paint's edge, in elements of the paint
 _EDGE_WEIGHT = 0.3  # weight of an edge: a marking has two in several pieces each, which err together
-_FLAT = 0.12  # least sine of an edge's rise: flatter ones are of stop lines and of shadows across the road
+_FLAT = 0.12  # least sine of an edge's rise: flatter edges are stop lines and shadows across the road
 
 # Standard deviation of the directions of one road's lines; 0.012 rad in lanes/curves, whose camera is known.
 _PARALLEL_SIGMA_RAD = 0.015
 
 _SHARE = 0.4  # share of the lines that keep to the road: kerbs, arrows, letters and façades need not
 _POINT_SIGMA_PX = 1.5  # standard deviation of the lines through a vanishing point about it, px
-_SILENT = 0.05  # share of images whose lines are of something else
+_SILENT = 0.05  # share of images whose lines show something else
 
 _AHEAD_RAD = np.deg2rad(6.0)  # standard deviation of a road's direction about the camera's axis
 _AHEAD_SHARE = 0.85  # share of the images in which the road leads ahead so closely
@@ -46,7 +46,7 @@ _ROLL_STEP_RAD = np.deg2rad(0.75)  # distance between the rolls of the grid
 _COLUMN_STEP_RAD = np.deg2rad(1.25)  # distance between the bearings of vanishing points that are looked at
 _SIGMAS = 4.0  # standard deviations of the prior that the grid reaches from its mean
 _REACH_RAD = np.deg2rad(40.0)  # largest bearing of vanishing points that are looked at
-_STEEPEST_RAD = np.deg2rad(80.0)  # steepest pitch that is told from others: lines look parallel from above
+_STEEPEST_RAD = np.deg2rad(80.0)  # steepest pitch that lines determine: from above they look parallel
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def _lines(
 
 
 def _edges(paint: np.ndarray, unit_px: float, top_px: int, info: CameraInfo) -> Lines:
-    """The straight edges of paint, of which there are log odds (h, w), ``unit_px`` to an element."""
+    """The straight edges of paint from its log odds (h, w); an element is ``unit_px`` wide."""
     level = np.round(255 * as_probability(paint)).astype(np.uint8)
     segments = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE).detect(level)[0]
     ends = np.zeros((0, 2, 2)) if segments is None else segments.reshape(-1, 2, 2).astype(np.float64)

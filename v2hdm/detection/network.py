@@ -57,7 +57,7 @@ def as_probability(odds: np.ndarray) -> np.ndarray:
 
 
 def as_log_odds(probability: np.ndarray) -> np.ndarray:
-    """Log odds, in the shape of the probabilities, of which those near 0 or 1 say no more than others."""
+    """Log odds of probabilities, clipped so that those near 0 or 1 do not dominate."""
     share = np.clip(probability, 1.0 - _MOST_CERTAIN, _MOST_CERTAIN)
     return np.asarray(np.log(share / (1.0 - share)))
 

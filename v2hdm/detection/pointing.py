@@ -15,7 +15,7 @@ from v2hdm.safe.texts import shown
 
 _log = logging.getLogger(__name__)
 
-_SAME_S = 0.05  # difference, s, of the times of an image and of a line that is of it
+_SAME_S = 0.05  # largest difference, s, between the times of an image and of its line
 
 
 _KEPT = 16  # lines that are kept

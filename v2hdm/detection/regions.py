@@ -89,7 +89,7 @@ def _boxes(regions_px: FloatArray, rows: tuple[int, int], width: int, grid: int)
 
 
 def merged(boxes: IntArray) -> IntArray:
-    """Boxes (N, 4) of which those that overlap, or nearly do, are one."""
+    """Boxes (N, 4) after joining those that overlap or nearly do."""
     left = boxes.tolist()
     out: list[list[int]] = []
     while left:

@@ -160,7 +160,7 @@ class RoadDetector:
 
     @classmethod
     def calibrated(cls, detector: Detector, calibration: Path, linear_response: bool = False) -> RoadDetector:
-        """As :meth:`load`, for a detector that is there already."""
+        """As :meth:`load`, with an existing detector."""
         content = read_calibration(calibration)
         try:
             return cls(detector, camera_from_calibration(content, linear_response), content)

@@ -11,7 +11,7 @@ from v2hdm.detection.road import Road, RoadDetector
 from v2hdm.detection.steps import Steps
 
 _STEP_S = 0.02  # time that a step takes, s, before any was timed: a whole image takes 70 ms in seven
-_SLOWER = 0.3  # share of a step's time by which the next of its kind may take longer
+_SLOWER = 0.3  # the next step of a kind may take this share longer
 _FORGETS = 0.9  # of the longest time of a step that is kept from one to the next
 _IMPATIENT = 0.8
 """Share of a step's longest time that is kept from one image to the next while there is no time for the step.

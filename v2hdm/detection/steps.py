@@ -14,7 +14,7 @@ Steps = Generator[None, None, _Result]
 
 
 def timed(stage: str, steps: Steps[_Result]) -> Steps[_Result]:
-    """Steps of a stage, each of which is timed as a part of it."""
+    """Steps of a stage, each timed as a part of it."""
     while True:
         try:
             with lap(stage):

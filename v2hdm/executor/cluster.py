@@ -96,7 +96,7 @@ class _Step(NamedTuple):
 
 
 class _Course:
-    """The jobs of one stage that are under way, and what is heard of them."""
+    """The running jobs of one stage, and their reports."""
 
     def __init__(self, cluster: Cluster, token: str, processes: int) -> None:
         self.futures: dict[int, Future[Any]] = {}
@@ -131,7 +131,7 @@ class _Course:
         future.add_done_callback(lambda _: self.inbox.put(number))
 
     def next_message(self) -> _Step | int:
-        """The next step that is told, or the number of a job that is over; else WorkerError."""
+        """The next reported step, or the number of a finished job; raises WorkerError otherwise."""
         client = self._cluster.client
         last_s = time.monotonic()
         while True:
@@ -166,7 +166,7 @@ class _Course:
 
 @contextmanager
 def _under_way(cluster: Cluster, stage: Stage[Any, Any]) -> Iterator[_Course]:
-    """The course of a stage; whatever of it is left at the end is stopped."""
+    """Run a stage; its remaining jobs are stopped at the end."""
     client = cluster.client
     token = secrets.token_hex(8)
     course = _Course(cluster, token, stage.processes)

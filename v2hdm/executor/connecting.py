@@ -45,7 +45,7 @@ _LOCAL = {
 
 
 def quiet() -> None:
-    """Keep what Dask logs off the terminal: what matters of it are our errors."""
+    """Keep Dask's log off the terminal: our errors report what matters."""
     for name in list(logging.root.manager.loggerDict):
         if name.split(".")[0] in ("distributed", "tornado"):  # each has a level of its own
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)

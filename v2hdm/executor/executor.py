@@ -72,14 +72,14 @@ class Executor(ABC):
     def outcomes(
         self, stage: Stage[_Job, _Result], jobs: Sequence[_Job], progress: JobProgress, at_once: int
     ) -> Outcomes[_Result]:
-        """Each job's number and result as it is done, ``at_once`` of them at most under way.
+        """Each job's number and result when it finishes; at most ``at_once`` jobs run.
 
         A job whose process dies is begun once more, and a WorkerError is its result where that dies, too. An
         exception of the work is raised here, as it was there.
         """
 
     def close(self) -> None:  # noqa: B027  # most have nothing to end
-        """End what was started."""
+        """End the started processes."""
 
     def side_by_side(
         self,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from v2hdm.errors import ConfigError
 from v2hdm.executor.executor import HERE, Executor, JobProgress, Outcomes, Stage
+from v2hdm.executor.memory import keep_freed_memory
 
 _SCHEMES = ("tcp://", "tls://")
 BATCH_SYSTEMS = {
@@ -59,6 +60,7 @@ def open_executor(
         ConfigError: names the address, and the worker, where the cluster cannot be used.
     """
     check_cluster(cluster)
+    keep_freed_memory()
     workers = workers or os.cpu_count() or 1
     if not cluster and workers <= 1 and not isolated:
         yield HERE

@@ -26,6 +26,7 @@ import cv2
 
 from v2hdm.errors import WorkerError
 from v2hdm.executor.executor import TWICE_DEAD, Executor, JobProgress, Outcomes, Stage
+from v2hdm.executor.memory import keep_freed_memory
 from v2hdm.progress import silent
 from v2hdm.settings import THREAD_VARIABLES
 
@@ -96,7 +97,7 @@ class _Pool:
             self._pool = ProcessPoolExecutor(workers, spawn, _begin, (stage,))
 
     def submit(self, job: object) -> Future[Any]:
-        """Have a job done; where processes have died, its result says so."""
+        """Submit a job; its future fails if a process of the pool has died."""
         with undisturbed_starts():
             try:
                 return self._pool.submit(_perform, job)
@@ -142,6 +143,7 @@ def _perform(job: object) -> object:
 
 def prepare_process() -> None:
     """Make a worker process one of one thread, whose log is for the results to state."""
+    keep_freed_memory()
     cv2.setNumThreads(1)
     torch: Any = sys.modules.get("torch")
     if torch is not None:
@@ -175,7 +177,7 @@ def undisturbed_starts() -> Iterator[None]:
 
 
 def _start_tracker() -> None:
-    """Start the process that frees what killed processes leave; that it does so is no news for a user."""
+    """Start the resource tracker, and silence its messages on killed processes."""
     sys.warnoptions.append("ignore:resource_tracker:UserWarning")  # which it inherits
     try:
         resource_tracker.ensure_running()

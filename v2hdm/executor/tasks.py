@@ -123,7 +123,7 @@ class _Messages:
 
 
 def _portable(failure: Exception) -> Exception:
-    """The exception itself where it can travel, else one that says as much."""
+    """The exception if it can be pickled, else one with the same message."""
     try:
         pickle.loads(pickle.dumps(failure))
     except Exception:
@@ -151,7 +151,7 @@ def _raise_in(thread: int, exception: type[BaseException] | None) -> None:
 
 
 async def stop(token: str) -> None:
-    """Stop the jobs of a stage in this process, so that they tidy up; gives those in long calls up."""
+    """Stop a stage's jobs in this process so that they clean up; jobs in long calls are abandoned."""
     await asyncio.to_thread(_stop, {token})
 
 

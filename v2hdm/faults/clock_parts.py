@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from v2hdm.adjust.problem import Problem
-from v2hdm.adjust.sections.summary import JoinedCovariance
+from v2hdm.adjust.sections.joined import JoinedCovariance
 from v2hdm.adjust.solution import Solution
 from v2hdm.faults.clock_errors import ClockEvidence, errors_of_clocks
 from v2hdm.faults.jacobians import Whitened
@@ -138,7 +138,7 @@ def _drawn(solved: Sensitivity, along: Along) -> list[Rows]:
 
 
 def _is_counted(solved: Sensitivity, along: Along) -> BoolArray:
-    """Which residuals (R,) are of the drive: not what holds a border, or what another part counts.
+    """Whether each residual (R,) belongs to the drive: no border condition, and no other part counts it.
 
     The first states after a border are predicted from another part, which this part's rows do not know.
     """

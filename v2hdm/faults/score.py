@@ -31,7 +31,7 @@ class ScoreTest:
     # log-likelihood ratio of the fault, each segment predicted from the others; negative if they disagree.
     # Surveyed centres and planes of the ground belong to no segment and count as they are.
     gain: float = 0.0
-    # Root mean square motion of the corners, m, under a value of 1; 0 for all but lenses.
+    # Root mean square motion of the corners, m, for an error of 1; 0 except for lenses.
     moves_m: float = field(default=0.0, kw_only=True)
 
     @property
@@ -47,7 +47,7 @@ class ScoreTest:
 
 @dataclass(frozen=True)
 class Contradiction(ScoreTest):
-    """A possible error of one input, in the user's terms: of which cameras, and ``about`` what."""
+    """A possible error of one input, in the user's terms: its cameras, and what it is ``about``."""
 
     cameras: tuple[str, ...] = ()
     about: str = ""

@@ -30,9 +30,7 @@ from v2hdm.faults.jacobians import Jacobians, Steps, Whitened
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 
-_STEP = (
-    1e-3  # step of the central differences of priors, in the fault's unit (s or rad): millimetres of motion
-)
+_STEP = 1e-3  # step of the priors' central differences, s or rad: millimetres of motion
 STRETCHES = 24  # segments of a session's route: metres each, longer than the correlation of most errors
 _DRAWS = 16  # draws of the model's noise, which give the expected disagreement to a tenth
 _ERRORS_OF_POSES = ((0, 1), (2,), (3, 4), (5,))
@@ -42,7 +40,7 @@ NOISES = len(_ERRORS_OF_POSES) + 2
 """Kinds of noise: that of observations, the errors of poses, and that of all other priors."""
 
 POSITION_NOISE = 1
-"""The kind that is of positions."""
+"""The kind of position errors."""
 
 _AT_ONCE = 64  # columns whose gradients are in memory at a time
 _NUMBERS_AT_ONCE = 1 << 25  # most numbers, of 8 bytes, in columns that are solved for together

@@ -35,7 +35,7 @@ _POLAR = ("EPSG:32661", "EPSG:32761")  # polar grids of WGS84, north and south
 
 
 def is_same_datum(name: str, other: str) -> bool:
-    """Whether two names are of one datum, as far as spelling goes: WGS84, WGS 84 and wgs84 are."""
+    """Whether two names spell the same datum: WGS84, WGS 84 and wgs84 do."""
     return _plain(name) == _plain(other)
 
 

@@ -21,9 +21,7 @@ _SEMI_MAJOR_M = 6378137.0  # semi-major axis, m, of the ellipsoid WGS84 (NGA.STN
 _FLATTENING = 1 / 298.257223563  # flattening of the ellipsoid WGS84 (NGA.STND.0036)
 _ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)  # square of the first eccentricity of WGS84
 
-_SAME_ELLIPSOID_M = (
-    1e-3  # difference, m, of axes of one ellipsoid: GRS80's semi-minor is 0.1 mm longer than WGS84's
-)
+_SAME_ELLIPSOID_M = 1e-3  # axes that differ less, m, are of one ellipsoid: GRS80's and WGS84's by 0.1 mm
 _WGS84 = ("World Geodetic System 1984", "World Geodetic System 1984 ensemble")  # datum's names in PROJ
 _CONFORMAL_DEG = 1e-3  # tolerance, deg, of a conformal grid's angles, for rounding
 
@@ -83,8 +81,8 @@ _LONGEST_CRS = 20_000  # letters of a system's description: WKT of a compound on
 LOCAL = "local"  # name of the map's own frame as a coordinate system
 _GRID_DECIMALS = 4  # decimals of a coordinate in metres: 0.1 mm
 _DEGREE_DECIMALS = 9  # decimals of a latitude or longitude in degrees: 0.1 mm on the ground
-_ZONE_DEG = 6.0  # width of a zone, deg of longitude, by which a grid may be used beyond its edges for a job
-_BESIDE_DEG = 1.0  # longitude, deg, by which a zone's grid is in use beyond its edges
+_ZONE_DEG = 6.0  # deg of longitude that a job's grid may reach beyond a zone's edges: one zone
+_BESIDE_DEG = 1.0  # deg of longitude that a zone's grid is used beyond the zone's edges
 
 
 @dataclass(frozen=True)

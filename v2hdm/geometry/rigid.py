@@ -238,7 +238,7 @@ def interpolate(
 
 
 def in_order(image: Image) -> tuple[int, float, str]:
-    """Key by which a drive's images are sorted."""
+    """The sort key of a drive's images."""
     return image.session, image.taken_s, image.camera
 
 
@@ -254,7 +254,7 @@ def with_clock_offsets(
     root = drive.sessions[session].root
     trajectory = drive.sessions[session].trajectory
     if trajectory is None:
-        raise DriveError(f"{root}: holds no trajectory to pose its images anew from")
+        raise DriveError(f"{root}: holds no trajectory to interpolate new poses from")
     images: list[Image] = [image for image in drive.images if image.session != session]
     for name in dict.fromkeys(image.camera for image in drive.images if image.session == session):
         images_of_camera = [

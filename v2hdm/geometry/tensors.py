@@ -1,7 +1,7 @@
 """IPM, depths and lenses in torch and kornia, for mapping, adjustment and the mosaic.
 
 Functions take any leading ``*batch`` dimensions, float32 or float64, and are differentiable on their domain.
-:func:`inverse` and :func:`inverse_depth` stand in the solver's inner loop: hence the closed form.
+:func:`inverse` and :func:`inverse_depth` run in the solver's inner loop, so they use the closed form.
 """
 
 from __future__ import annotations

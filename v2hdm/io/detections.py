@@ -156,7 +156,7 @@ def _reversed(marking: MarkingDetection) -> MarkingDetection:
 def _score(entry: Mapping[str, Any], where: str) -> float:
     score = take_number(entry.get("score", 1.0), f"{where}, score", DriveError)
     if not 0 <= score <= 1:
-        raise DriveError(f"{where}, score: {score:g} is no probability; give one from 0 to 1")
+        raise DriveError(f"{where}, score: {score:g} is not a probability; give one from 0 to 1")
     return score
 
 

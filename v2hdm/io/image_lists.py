@@ -22,7 +22,7 @@ _APPLE_DOUBLE = "._"  # begins the names of files that macOS writes beside other
 _TIMECODES = ("# timecode format v2", "# timestamp format v2")  # first lines of Matroska's, in ms
 _SEPARATED = re.compile(r"([^\s,;]+)\s*[,;]\s*(?!\d+\s)(.+)")  # but 12,5 FILE is a decimal comma
 _TITLE = re.compile(r"[^\W\d_][^\d.]*$")  # a line of words alone
-_MOST_DOUBLED = 0.25  # share of images whose time repeats, chosen: more are of two cameras
+_MOST_DOUBLED = 0.25  # largest share of images with a repeated time, chosen: more mean two cameras
 
 
 class ImageList(NamedTuple):
@@ -72,7 +72,7 @@ def _unquoted(text: str) -> str:
 
 
 def _on_this_system(name: str, folder: Path) -> str:
-    """A file's name, of which a list from Windows separates the folders by backslashes."""
+    """A file's name, with the backslashes of a list from Windows turned into slashes."""
     return name.replace("\\", "/") if "\\" in name and not (folder / name).exists() else name
 
 

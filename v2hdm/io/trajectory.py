@@ -33,8 +33,8 @@ _FARTHEST_M = 1e8  # coordinates on the earth end at ten thousand kilometres
 _FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m below it
 _LEAP_M = 1e4  # least step, m, between poses that another grid's coordinates make: a zone's are 400 km off
 _FASTEST_MPS = 300.0  # no vehicle is faster, m/s
-_STRAYS = 0.05  # share of times out of order up to which these are left out; more are of two recordings
-LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
+_STRAYS = 0.05  # largest share of times out of order that is left out; more mean two recordings
+LATE_S = 1.0  # a reading this late after its successor comes from another clock or recording
 
 _UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 """How many of each unit, in which stamps may be by mistake, make a second."""
@@ -52,7 +52,7 @@ _CLOCKS: Mapping[float, str] = {
     37.0: "one is TAI (PTP), the other UTC (37 s since 2017)",
     315964800.0: "one counts from 1970, the other from 1980, as GPS does",
     315964782.0: "one is UTC since 1970, the other GPS time since 1980",
-    619315200.0: "the receiver's date is 1024 weeks early: its count of weeks has begun anew",
+    619315200.0: "the receiver's date is 1024 weeks early: its week number has rolled over",
 }
 """Differences of clocks that are mixed up, s (IERS Bulletin C; IS-GPS-200)."""
 
@@ -143,7 +143,7 @@ def read_tum(path: Path) -> Trajectory:
     stamp_s = table[:, 0] / (layout.per_s or units_per_second(table[:, 0]))
     order = in_order(stamp_s, str(path), "pose")
     if lost:
-        _log.warning("%s: left out %d of %d poses that are no numbers", path, lost, lost + len(table))
+        _log.warning("%s: left out %d of %d poses that are not numbers", path, lost, lost + len(table))
     if len(order) < len(table):
         left_out = len(table) - len(order)
         _log.warning("%s: left out %d of %d poses of equal or stray times", path, left_out, len(table))

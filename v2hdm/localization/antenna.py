@@ -12,7 +12,7 @@ from v2hdm.localization.places import Prior, vehicle_at
 from v2hdm.records import FloatArray
 
 _COURSE_S = 10.0  # time, s, over which the odometry lays out a course
-_BIAS_RAD_S = 0.003  # yaw rate, rad/s, by which it may be off
+_BIAS_RAD_S = 0.003  # standard deviation of its bias, rad/s
 _LEAST_RAD = np.deg2rad(1.0)  # standard deviation, rad, that a course has at least: slip, the antenna's place
 _LEAST_M = 0.5  # standard deviation, m, of a place to search about: the map's own error is unknown
 _GATE = 3.717  # sigmas that one position in a thousand exceeds

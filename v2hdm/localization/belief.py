@@ -194,7 +194,7 @@ def foresee(
 
 
 def _untold(mean: FloatArray, late_s2: float, length_s: float) -> FloatArray:
-    """The covariance (11, 11) of what a vehicle has done since what its late odometry tells of.
+    """The covariance (11, 11) of the vehicle's motion since the newest odometry, which is late.
 
     ``late_s2`` is the variance of the lateness, s^2. The last speed and yaw rate are taken to last until now;
     accelerations since then move the place along and the heading. The last belief, ``length_s`` ago, was

@@ -1,4 +1,4 @@
-"""The localiser: the newest looks and the odometry in, the vehicle's pose and what it is worth out."""
+"""The localiser: takes the newest detections and the odometry, gives the vehicle's pose and its bounds."""
 
 from __future__ import annotations
 
@@ -45,25 +45,23 @@ from v2hdm.localization.starting import Quest
 from v2hdm.localization.way import Way
 from v2hdm.records import BoolArray, Calibration, FloatArray, HDMap
 
-_LAG_S = 1.0  # images may be so late
-_NO_IMAGE_S = 1.0  # time, s, without an image that is said
-_FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, is of another clock
+_LAG_S = 1.0  # images may be this late, s
+_NO_IMAGE_S = 1.0  # time without an image, s, after which a reason says so
+_FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, comes from another clock
 # With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
 _LOST_M = 0.3
 _MOST_FEATURES = 36  # markings, stretches of lines and areas whose places' errors are states: those seen last
-_STARTED = 4  # images from the start on whose agreement makes it sure
-_START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # of a place that was found, m, m and rad
-_UNSTATED = np.diag(np.square([0.01, 0.01, 0.01, *(3 * [np.deg2rad(0.05)])]))  # of a calibration without one
-_AGAIN_SIGMA_M = (
-    4.0  # standard deviation of the place, m, and of the heading, rad, from which a lost one is sought
-)
-_AGAIN_SIGMA_RAD = 0.2  # of its heading
-_TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
-_LOOSENED_RAD = np.deg2rad(0.2)  # of what a mounting has turned that is found to have turned slowly
-_PINNED_RAD = np.deg2rad(0.01)  # of what the others have meanwhile
-_BEFORE_S = 0.25  # so long before it was noticed, s, a mounting may have turned
-_LATER_S = 0.1  # standard deviation, s, of how much later than thought an odometry may be
-_UNDECIDED_S = 0.5  # time, s, for which no bound is stated after an image that both may explain
+_STARTED = 4  # number of images after the start that must agree before the place is sure
+_START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # standard deviations of a place found, m, m, rad
+_UNSTATED = np.diag(np.square([0.01, 0.01, 0.01, *(3 * [np.deg2rad(0.05)])]))  # where a calibration has none
+_AGAIN_SIGMA_M = 4.0  # standard deviation of a lost vehicle's place when the search begins again, m
+_AGAIN_SIGMA_RAD = 0.2  # standard deviation of its heading then, rad
+_TURNED_RAD = np.deg2rad(1.0)  # standard deviation of the turn of a camera that was pushed
+_LOOSENED_RAD = np.deg2rad(0.2)  # standard deviation of the turn of a mounting that turned slowly
+_PINNED_RAD = np.deg2rad(0.01)  # standard deviation of the other mountings' turn meanwhile
+_BEFORE_S = 0.25  # a mounting may have turned this long before it was noticed, s
+_LATER_S = 0.1  # standard deviation of an odometry's unexpected delay, s
+_UNDECIDED_S = 0.5  # time without a bound after an image with two possible causes, s
 _FEW = 0.7  # share of an image's detections under which a turned mounting and a late odometry are tried
 
 
@@ -149,14 +147,14 @@ class Localizer:
     def update(
         self, images: Sequence[Look] = (), motion: Sequence[Motion] = (), fixes: Sequence[Fix] = ()
     ) -> Pose:
-        """Take what is new, in any order, and say where the vehicle is at the newest stamp of all."""
+        """Take new detections and motions, in any order; return the pose at the newest stamp."""
         for sample in motion:
             problem = self._log.add(Motion(*(float(value) for value in sample)))
             if problem is not None:
                 self._forget(problem)
         if self._log.refused:
             self._reasons["odometry"] = (
-                f"{self._log.refused} samples of the odometry are no motion of a road vehicle; "
+                f"{self._log.refused} samples of the odometry are impossible for a road vehicle; "
                 "state m/s and rad/s"
             )
         self._way.follow_all_but(_LAG_S)
@@ -167,7 +165,7 @@ class Localizer:
         return replace(self._pose(), images_s=dict(self._images_s))
 
     def regions(self, camera: str, stamp_s: float) -> FloatArray | None:
-        """Where to look in the next image of a camera, taken at about a time: around what the map will show.
+        """The boxes to search in a camera's image at about ``stamp_s``: around markings that the map expects.
 
         Boxes (R, 4) of left, top, right and bottom, px, for :meth:`v2hdm.detection.road.RoadDetector.detect`.
         None to look everywhere: every few images, and where the place, the map or a mounting is in doubt, few
@@ -245,7 +243,7 @@ class Localizer:
             self._see(past.look, is_new=False)
 
     def _look_again(self, look: Look) -> None:
-        """Hold all that an image shows against the map; the look at parts of it has moved the belief."""
+        """Test the map with all of an image; its regions have moved the belief already."""
         self._looking.of(look.camera).note_all(look.stamp_s)
         earlier = [
             past.before
@@ -260,7 +258,7 @@ class Localizer:
         self._agreement.note(judged, self._way.length_m, look)
 
     def _see(self, look: Look, is_new: bool) -> None:
-        """Move the belief to a look, and take what that shows."""
+        """Predict the belief to a look and update it with the look."""
         calibration = self.calibrations[look.camera]
         quads = sighted(look, calibration)
         if is_new:
@@ -317,7 +315,7 @@ class Localizer:
         return range(begin, begin + 3)
 
     def _let_turn(self, since_s: float) -> None:
-        """Go back to before a mounting turned, and see again what came since with mountings that are free.
+        """Go back to before a mounting turned, and repeat the looks since then with free mountings.
 
         Which of them has turned is not known: what one image took for the vehicle's own roll, free
         mountings and the vehicle's springs, which fade, explain better and better.
@@ -352,7 +350,7 @@ class Localizer:
         return [self._numbers[turned.camera] for turned in self._rig.turned if turned.is_slow]
 
     def _located(self, belief: Belief, look: Look, quads: Sighted, is_new: bool) -> Belief:
-        """The belief after a look; other causes are tried where too little of it is explained."""
+        """The belief after a look; other causes are tried if it explains too little of the look."""
         noise = self._noise[look.camera]
         scene = self._scene(belief, look, quads)
         located = locate(belief, scene)
@@ -419,7 +417,7 @@ class Localizer:
         return Scene(quads, self.paint, plane, self._numbers[look.camera], calibration, factor)
 
     def _find(self, look: Look) -> None:
-        """Search for a place that explains what is seen as no other does."""
+        """Search for the one place that explains the detections."""
         local = self._way.at(look.stamp_s)
         proposal = self._search.propose(
             look, local, self._way.length_m, self.paint, self.areas, self.calibrations, self._tried
@@ -456,7 +454,7 @@ class Localizer:
         self._reasons.pop("lost", None)
 
     def _judge(self, look: Look) -> None:
-        """Whether the belief still holds, by what it explains."""
+        """Test whether the belief still explains the looks."""
         assert self._belief is not None
         if not self._is_sure:
             self._confirmed += self._matched.markings >= 2
@@ -474,7 +472,7 @@ class Localizer:
             self._forget("no marking of the map was seen for too long")
 
     def _forget(self, reason: str) -> None:
-        """Give the belief up, and search about where it was."""
+        """Drop the belief, and search around its last place."""
         prior = self._search.prior
         if self._belief is not None and self._is_sure:
             pose = self._belief.mean[:3].copy()
@@ -490,7 +488,7 @@ class Localizer:
         self._reasons["lost"] = reason
 
     def _fix(self, fix: Fix) -> None:
-        """Keep a position by RTK until the images of before it have come."""
+        """Keep an RTK position until all earlier images have come."""
         belief = self._belief
         if belief is None:
             self._way.follow(fix.stamp_s)
@@ -520,7 +518,7 @@ class Localizer:
         return self._moved_to(belief, stamp_s, has_untold)
 
     def _missing(self, stamp_s: float) -> dict[str, str]:
-        """Sentences on cameras of which no image has come lately."""
+        """Sentences on cameras that have sent no image lately."""
         if not self._images_s:
             waited_s = stamp_s - self._log.stamps_s[0] if self._log.stamps_s else 0.0
             return {"images": "no image has come yet"} if waited_s > _NO_IMAGE_S else {}
@@ -531,7 +529,7 @@ class Localizer:
         }
 
     def _pose_of_search(self, stamp_s: float, reasons: dict[str, str]) -> Pose:
-        """The pose while nothing is believed of the place."""
+        """The pose while the place is unknown."""
         if (quest := self._search.prior) is not None and not len(self.paint.near(quest.pose[:2], 60.0)):
             reasons["place"] = (
                 "no marking of the map lies within 60 m of where the vehicle should be: is it the map of "
@@ -539,11 +537,7 @@ class Localizer:
             )
             self._is_lost = True
         status = Status.LOST if self._is_lost or self._pace_reason else Status.INITIALISING
-        nothing = np.full((3, 3), np.inf)
-        infinite = (np.inf, np.inf)
-        return Pose(
-            stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0, 0.0), 0, tuple(reasons.values())
-        )
+        return Pose.unknown(stamp_s, status, tuple(reasons.values()))
 
     def _pose(self) -> Pose:
         """The pose at the newest stamp."""

@@ -29,7 +29,7 @@ _SLOPE_REACHES_S = (
 _LEAST_SAMPLES = 4  # samples from which a slope, and what it may be wrong by, is known
 _NOISE_SAMPLES = 64  # samples by whose deviations from their neighbours the noise is known
 _MEDIAN_SQUARE = 0.455  # median of the square of a standard normal
-_CLOCK_BACK_S = 1.0  # a stamp that lies farther back than this, s, is of a clock that was set
+_CLOCK_BACK_S = 1.0  # a stamp that lies farther back than this, s, comes from a clock that was set
 
 
 class Motion(NamedTuple):
@@ -86,7 +86,7 @@ class MotionLog:
     refused: int = 0
     late: int = 0
     _noise: FloatArray = field(default_factory=lambda: np.zeros(2))  # variances of speeds and of yaw rates
-    _noise_at: tuple[int, float] | None = None  # number and time of the samples of which these are
+    _noise_at: tuple[int, float] | None = None  # number and time of the samples that these belong to
 
     def add(self, sample: Motion) -> str | None:
         """Take a sample; a sentence where the clock was set back, so that nothing before it counts."""

@@ -10,11 +10,11 @@ from v2hdm.localization.belief import Plane
 from v2hdm.records import SEEN_ACROSS, UNSTATED_DRIFT_OVER_M, UNSTATED_SIGMA_M, FloatArray, HDMap, IntArray
 
 _VIEW_M = 20.0  # distance, m, between what a vehicle sees ahead and behind
-_CELL_M = 10.0  # side of the squares by which markings are looked up
+_CELL_M = 10.0  # cell size of the lookup grid of markings, m
 _GROUND_M = 8.0  # distance, m, over which the ground counts as a plane: a truck's length
 _GROUND_SIGMA = 0.1  # standard deviation of a slope before any height is known, m/m
 _HEIGHT_SIGMA_M = 0.03  # standard deviation of a marking's height about the plane, m
-_PLANE_M = 1.0  # side of the squares of which each has its plane, m
+_PLANE_M = 1.0  # cell size of the grid of ground planes, m
 _MOST_PLANES = 256  # planes that are kept
 
 

@@ -20,9 +20,7 @@ from v2hdm.localization.paint import Paint
 from v2hdm.localization.seeing import Sighted, ground_points
 from v2hdm.records import Calibration, FloatArray, IntArray
 
-_RANGE_M = (
-    14.0  # distance, m, of detections that make the patch: farther ones are misplaced by a nod of the vehicle
-)
+_RANGE_M = 14.0  # range, m, of detections in the patch: a pitching vehicle misplaces farther ones
 _SAME_M = 0.5  # distance, m, of detections that are one marking
 _PATCH_M = 25.0  # way, m, over which the odometry lays out a patch
 _MOST = 40  # detections of a patch, the latest
@@ -149,7 +147,7 @@ def search(
     prior: Prior | None,
     word_scores: WordScores = _no_words,
 ) -> list[Place]:
-    """The places of a patch, the likeliest first; ``prior`` is of the vehicle at a pose of the odometry."""
+    """The places of a patch, the likeliest first; ``prior`` is the vehicle's at a pose of the odometry."""
     objects = patch.sure
     if len(objects) < 2 or not len(paint):
         return []

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
+import numpy as np
+
 from v2hdm.localization.rig import Turned
 from v2hdm.records import FloatArray
 
@@ -51,3 +53,9 @@ class Pose:
     matched_lines: int = 0
     matched_areas: int = 0
     images_s: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def unknown(cls, stamp_s: float, status: Status, reasons: tuple[str, ...]) -> Pose:
+        """The pose of a vehicle whose place nothing has shown yet."""
+        nothing = np.full((3, 3), np.inf)
+        return cls(stamp_s, status, None, nothing, (np.inf, np.inf), np.inf, (1.0, 0.0, 0.0), 0, reasons)

@@ -26,7 +26,7 @@ EVERY_FULL = 5
 
 _RANGE_M = 20.0  # distance, m, up to which markings are found at almost every look
 _MOST = 8  # markings that are looked for: of more, few say anything new of a vehicle's six unknowns
-_LEAST = 4  # markings with which a look is worth it; where fewer are expected, all may be searched
+_LEAST = 4  # least expected markings to search regions alone; with fewer, whole images may be searched
 _MOST_SHARE = 0.16  # share of the image that is looked at
 # Ranks of markings by distance, in parts of their number, in the order in which they are chosen.
 _HALVES = (0.0, 1.0, *(numerator / 2**power for power in range(1, 5) for numerator in range(1, 2**power, 2)))
@@ -34,15 +34,15 @@ _AROUND_M = 0.25  # way, m, around a marking that is looked at
 _AROUND_PX = 6.0  # px beside
 _SIGMAS = 4.0  # of the place in the image, beside
 EARLY_S = 0.05
-"""Time, s, by which an image may be taken earlier or later than it was expected."""
+"""Largest difference, s, between an image's expected and actual time."""
 
 _BESIDE = 0.25  # share of an image's size beside it, up to which a lens' polynomial is taken at its word
 _SURE_M, _SURE_RAD = 0.15, np.deg2rad(1.0)  # standard deviations of a place that is known well enough
 _SURER_M = 0.04  # standard deviation, m, of one at which fewer than the least markings are worth a look
-_LAST_LOOKS = 10  # looks of a camera by which its interval is known
+_LAST_LOOKS = 10  # looks of a camera that determine its interval
 _SLOW_S = 0.5  # interval, s, after which nothing is expected at its place any more
-_AHEAD = 4  # images to come that are told of: a look may last longer than it takes to the next
-_EARLIER = 3  # images by which a whole search may come earlier, so that it is at no other camera's time
+_AHEAD = 4  # number of coming images announced: a look may last longer than the interval
+_EARLIER = 3  # images that a whole search may come earlier, to avoid the other cameras' whole searches
 _PATIENCE = 2.0  # so many times its turn a whole search is waited for, before it comes first
 _FOUND = 0.6  # share of the markings looked for, from which the last look was as expected
 _SOME = 0.3  # share from which it was so in part

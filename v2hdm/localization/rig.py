@@ -58,7 +58,7 @@ _BACK_SHARE = 0.4  # of a change: a mounting that is nearer to where it was has 
 _WANDER_RAD = np.deg2rad(0.012)
 _STEP_S = 0.5  # time between two estimates that are kept
 _MOST = 240  # estimates that are kept: of the older half every second one is dropped when there are more
-_COURSE = 40  # estimates by which the beginning of a change is found
+_COURSE = 40  # number of estimates that locate the beginning of a change
 _AT_ONCE_S = 2.0  # a mounting that changed within less was pushed
 _ANGLES = ("pitch", "yaw", "roll")  # of a camera, about its axes right, down and forward
 
@@ -86,7 +86,7 @@ class Change(NamedTuple):
     """How a mounting has changed since a time."""
 
     before: Estimate
-    after: Estimate  # by which the change was found
+    after: Estimate  # the estimate that showed the change
     since_s: float
     until_s: float  # when it was as far as it is now
     angle: str  # that changed most surely
@@ -126,7 +126,7 @@ class MountingTest:
             if not self.change.is_undone(now):
                 self._keep(now)
                 return self.change
-            # The changed estimates are of a mounting that was put right.
+            # The changed estimates belong to a mounting that was corrected.
             begin_s = self.change.since_s
             self.estimates = [item for item in self.estimates if item.stamp_s <= begin_s]
             self.change = None
@@ -160,7 +160,7 @@ class MountingTest:
         return np.asarray((moved * np.linalg.solve(spread, moved[..., None])[..., 0]).sum(axis=1))
 
     def _change(self, before: Estimate, now: Estimate) -> Change:
-        """When the change began, and whether it is one of a moment: the ramp that fits the estimates best."""
+        """When the change began and whether it was sudden, from the ramp that fits the estimates best."""
         moved = now.turn_rad - before.turn_rad
         sigma = np.sqrt(np.abs(np.diag(before.covariance_rad2 - now.covariance_rad2)) + _WANDER_RAD**2)
         axis = int(np.argmax(np.abs(moved) / sigma))

@@ -85,7 +85,7 @@ class Sighted(NamedTuple):
 
 
 def sighted(look: Look, calibration: Calibration) -> Sighted:
-    """The quadrilaterals of a look of which two corners or more say anything."""
+    """The quadrilaterals of a look with two or more informative corners."""
     quads = [marking for marking in look.markings if not len(marking.outline_px)]
     corners = np.array([quad.corners_px for quad in quads], dtype=np.float64).reshape(-1, 4, 2)
     covariance = np.array([quad.covariance_px for quad in quads], dtype=np.float64).reshape(-1, 8, 8)
@@ -121,7 +121,7 @@ def pieces_of_lines(look: Look, calibration: Calibration) -> list[FloatArray]:
 
 
 class Hull(NamedTuple):
-    """The outline of a symbol or area in an image, of which nothing is hidden."""
+    """The outline of a symbol or area in an image, if nothing hides any of it."""
 
     kind: str
     points_px: FloatArray  # (N, 2) pinhole px

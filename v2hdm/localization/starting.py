@@ -18,12 +18,12 @@ from v2hdm.localization.seeing import Look
 from v2hdm.localization.words import WordPatch
 from v2hdm.records import Calibration, FloatArray
 
-# Log likelihood by which one place must explain what is seen better than any other: one wrong in e^10.
+# Least log likelihood ratio of the best place to any other: one wrong in e^10.
 _SURER_BY = 10.0
 _LEAST_MATCHED = 4  # markings of the place
 _LEAST_SHARE = 0.6  # of what is seen
 _SEARCH_S = 0.3  # time between searches
-_TRIED_LOOKS = 4  # images, of as many searches, by which a place is tried
+_TRIED_LOOKS = 4  # images, each a search, that test a place
 _TRIED_PLACES = 6  # places that are tried: each costs as much as the images of 0.2 s
 _LOST_S, _LOST_WAY_M = 0.8, 8.0  # after so long, or so far, without a place nothing fits
 _STILL_M = 0.5  # a vehicle that has moved less stands: it may not have seen enough

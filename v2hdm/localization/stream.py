@@ -50,7 +50,7 @@ class MotionLines:
             try:
                 content = json.loads(line)
             except ValueError as error:
-                raise ConfigError(f"{at}: is no JSON object ({error}); {_GIVE}") from None
+                raise ConfigError(f"{at}: is not a JSON object ({error}); {_GIVE}") from None
         elif self._columns is None:
             self._columns = [name.strip() for name in line.split(",")]
             if not any(set(need) <= set(self._columns) for need in (_MOTION, _LOCAL, _GEODETIC)):

@@ -72,6 +72,16 @@ class Inputs:
         max_range_m = self.options.lanes.max_range_m
         return collect_lane_points(self.drive, self.detections, ground, max_range_m, jitter_rad)
 
+    def without_markings(self) -> Inputs:
+        """The inputs whose sightings are collected, without the markings among their detections.
+
+        These are no more asked for, but take longer to keep and to read again than all else together.
+        """
+        detections = [replace(in_image, markings=()) for in_image in self.detections]
+        bare = replace(self, detections=detections)
+        vars(bare).update(sightings=self.sightings, optimiser=self.optimiser)
+        return bare
+
     @cached_property
     def tracks(self) -> Association:
         """Sightings linked from image to image under the initial IPMs."""

@@ -108,6 +108,8 @@ class Optimiser:
         self.pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
         self._variance_factor = 1.0
+        self.settled_gap = SolveOptions.gap_tolerance
+        """Gap of the solve that settles, for whoever solves again to be had sooner."""
         self.held_out: Mapping[str, float] = {}
         self.camera_names = sightings.cameras
         start = initial_rig(self._cameras, sightings.map_from_vehicle)
@@ -391,7 +393,7 @@ class Optimiser:
         estimated = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
         self.estimated_sigma = estimated
         self._pose_sigma = tuple(map(larger_noise, stated, estimated))
-        return self._solve_all(bundle.association, bundle.rig, is_near=True)
+        return self._solve_all(bundle.association, bundle.rig, gap=self.settled_gap, is_near=True)
 
     @property
     def variance_factor(self) -> float:

@@ -64,7 +64,7 @@ def check_together(base: Base, drive: Drive, path: str) -> None:
     if nearest_m > _SITE_M:
         raise MapFileError(
             f"map.base: drive {drive.name} comes no nearer than {nearest_m:.0f} m to a marking of {path}: it "
-            "is of another site; map the drive by itself"
+            "is a map of another site; map the drive without map.base"
         )
 
 

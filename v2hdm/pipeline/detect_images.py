@@ -116,7 +116,7 @@ def detect_images(
 
 
 def _check_numbers(mounting: Sequence[float] | None, limit: int | None) -> None:
-    """Raise ConfigError for a mounting that is not of three numbers, or no positive limit."""
+    """Raise ConfigError unless a mounting has three numbers and a limit is positive."""
     if mounting is not None and len(mounting) != 3:
         raise ConfigError(
             f"--mounting: {len(mounting)} numbers; give height (m), pitch (deg) and field of view (deg)"
@@ -195,7 +195,7 @@ def _of_camera(number: int, road: RoadDetector | None, rough: RoughCamera) -> It
 def _newest_frames(
     source: str, road: RoadDetector | None, rough: RoughCamera, are_read_ahead: bool
 ) -> Iterator[Frame]:
-    """The newest frame each time, of a camera or a folder, of which one may be read while another is seen."""
+    """The newest frame of a camera or a folder each time; the next is read while the last is processed."""
     path = Path(source)
     if source.isdecimal() and not path.exists():
         return NewestFrames(_of_camera(int(source), road, rough))
@@ -285,7 +285,7 @@ def _glances(
     regions: Regions | None,
     later: SecondLooks | None,
 ) -> Iterator[_Glance]:
-    """The road of every frame, and of some a second time once all of it was searched."""
+    """The road of every frame; some frames yield a second one after a search of the whole image."""
     while True:
         if later is not None and (second := later.look()) is not None:
             yield _Glance(Detected(second.frame, second.camera, second.road), None)

@@ -62,7 +62,7 @@ def graded(hd_map: HDMap, goal_m: float) -> HDMap:
 def accurate_enough(
     methods: CameraSets, least_accuracy: str, corrections: Sequence[Correction] = ()
 ) -> CameraSets:
-    """Results without what is of a worse grade than ``asked``, but with what a person has confirmed.
+    """Results without markings below ``least_accuracy``, except those that a person has confirmed.
 
     Raises:
         MappingError: nothing of the map of all cameras would be left.
@@ -114,7 +114,7 @@ def without_worse(
 
 
 def _with_fewer_markings(result: MethodResult, hd_map: HDMap) -> MethodResult:
-    """The result with a map some of whose markings are gone; the others have the ids that they had."""
+    """The result with some of its map's markings removed; the others keep their ids."""
     kept_ids = [marking.id or 0 for marking in hd_map.markings]
     residuals = result.residuals
     if residuals is not None:

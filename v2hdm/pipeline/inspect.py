@@ -68,7 +68,7 @@ def inspect_each(
 
 
 def join(inspections: Sequence[Inspection]) -> Inspection:
-    """Several drives, each inspected by itself, as one; findings name the drive that they are of.
+    """Inspect several drives one by one and join the findings; each finding names its drive.
 
     A camera that the bare ground of two drives puts on two mountings is two cameras. Raises DriveError where
     they are not of one frame or site.

@@ -76,7 +76,7 @@ def map_drive(
     all_maps: bool = False,
     section_m: float = 0.0,
 ) -> Result:
-    """Map a drive, or several through one site together; nothing is written, but what ``cache`` keeps.
+    """Map a drive, or several drives through one site together; only ``cache`` is written to.
 
     Args:
         drive: the drive or its folder, or several.
@@ -147,7 +147,7 @@ def _map(
 
 @contextmanager
 def _own_context(cache: Path | str | None, progress: Progress, workers: int) -> Iterator[Context]:
-    """The surroundings of a run that is given none."""
+    """The context of a run without one."""
     if cache is not None and Path(cache).is_file():
         raise ConfigError(f"cache {cache}: is a file; give a folder")
     stages = StageCache(None if cache is None else Path(cache))

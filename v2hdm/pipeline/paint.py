@@ -72,17 +72,7 @@ def _with_wear(
     shown |= {(image, number) for image in range(len(drive.images)) for number in unseen}
     grey = grey_reader(drive)
     assert grey is not None
-    return with_wear(
-        best.hd_map,
-        footage.images,
-        footage.map_from_vehicle,
-        footage.calibrations,
-        grey,
-        shown,
-        before,
-        context.threads,
-        best.surface,
-    )
+    return with_wear(best.hd_map, footage, grey, shown, before, context.threads)
 
 
 def _with_words(hd_map: HDMap, footage: Footage, drive: Drive, context: Context) -> HDMap:

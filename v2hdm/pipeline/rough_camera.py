@@ -1,4 +1,4 @@
-"""The detector for images of which no calibration is known: each has its horizon, told by all of them."""
+"""The detector for images without a calibration: all images together show each one's horizon."""
 
 from __future__ import annotations
 
@@ -23,18 +23,14 @@ from v2hdm.errors import ConfigError, DriveError
 from v2hdm.records import Camera, CameraInfo
 
 ROUGH_MOUNTING = (1.6, 5.0, 60.0)  # height (m), pitch, horizontal field of view (deg) where nothing is known
-ROUGH_NAME = "camera"  # the name of a camera of which no file is given
+ROUGH_NAME = "camera"  # name of a camera without a calibration file
 _UNKNOWN_PITCH_DEG = 8.0  # standard deviation of a pitch that nobody states, deg
 _STATED_PITCH_DEG = 4.0  # standard deviation of a pitch that the user states, deg
 _ROLL_DEG = 1.5  # standard deviation of a camera's roll about zero, deg
-_LOG_FOCAL = (
-    0.3  # standard deviation of the log of an assumed focal length: lenses of 46 to 76 deg are within
-)
+_LOG_FOCAL = 0.3  # standard deviation of an assumed focal length's log: lenses of 46 to 76 deg
 
 _LOOKS = 6  # images of a folder that are looked at before the first, so that it has a prior from others
-_SURE = (
-    0.9  # probability that a horizon is not above the rows that the network is run on; else it is run again
-)
+_SURE = 0.9  # least probability that the searched rows contain the horizon; else search again
 _LOOK_SHARE = 0.25  # time of a look in half the resolution, of one in full
 _KNOWN_RAD = np.deg2rad(0.5)  # a stream's horizon is said when its standard deviation is this
 
@@ -164,7 +160,7 @@ class RoughCamera:
         pitch, pitch_sigma, roll, roll_sigma = angles.tolist()
         where = "the folder's images" if self.folder else f"{frame.name} and earlier images"
         others = round(horizons.images * (1 - horizons.of_mounting))
-        exceptions = f"; {others} of the {horizons.images} looked at are of other mountings" if others else ""
+        exceptions = f"; {others} of the {horizons.images} looked at have other mountings" if others else ""
         print(
             f"from the lines of {where} the camera looks {pitch:.1f} +- {pitch_sigma:.1f} deg down, roll "
             f"{roll:.1f} +- {roll_sigma:.1f} deg{exceptions}",

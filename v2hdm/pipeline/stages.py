@@ -305,5 +305,5 @@ class _Work:
         _log.info("mapped with %s: %d markings, %.1f s", name, len(best.hd_map.markings), took_s)
         for exclusion in best.excluded:
             where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
-            _log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
+            _log.debug("%s: left out %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
         return MappedSet(methods, checked)

@@ -83,7 +83,7 @@ class Camera:
     linear_response: bool = False  # grey proportional to radiance, else sRGB
     own_vehicle: BoolArray | None = None  # (height, width) pixels that show the vehicle
     mounting_sigma: tuple[float, float] = (0.0, 0.0)  # of a guessed horizon (rad) and log focal length
-    read_out_s: float = 0.0  # first row to last, 0 for a global shutter; stamps are of the middle row
+    read_out_s: float = 0.0  # first row to last, 0 for a global shutter; stamps refer to the middle row
     frames: CameraFrames = CameraFrames()
     ground_plane: GroundPlane | None = None
 

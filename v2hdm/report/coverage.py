@@ -29,7 +29,7 @@ _RING = 48  # corners of the polygon that stands for a circle of that radius
 CELL_M = 0.25  # side of a cell of ground: finer than a marking, coarse enough for a port of kilometres
 ENOUGH_VIEWS = 3  # images that a marking needs: two for its parallax, and one that may fail
 _MOST_CELLS = 4_000_000  # of a site; larger ones get coarser cells, 16 MB of counts
-SECTORS = 4  # directions of view that are told apart: from the east, north, west and south
+SECTORS = 4  # number of directions of view: from the east, north, west and south
 _QUARTER_RAD = np.pi / 2  # angle of a sector
 _AHEAD_RAD = np.pi / 4  # half of it: the first sector lies about east
 

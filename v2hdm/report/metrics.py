@@ -57,7 +57,7 @@ def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray
 def symbols_driven_past(
     drive: Drive, truth: Truth, cameras: Sequence[str], least_sightings: int = MIN_SIGHTINGS
 ) -> BoolArray:
-    """True symbols (S,) of four corners of which :func:`driven_past` would say so.
+    """The true symbols (S,) with four corners that :func:`driven_past` would count as passed.
 
     ``least_sightings`` is the number of images that it asks for.
     """
@@ -156,7 +156,7 @@ def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[s
 
 
 def first_corners(mapped: Sequence[Marking], true: Sequence[Marking]) -> list[int]:
-    """Steps by which the corners of each mapped marking are rolled to come nearest to the true ones."""
+    """The steps to roll each mapped marking's corners by so that they come nearest to the true ones."""
     shifts = []
     for marking, counterpart in zip(mapped, true, strict=True):
         errors = [np.roll(marking.corners_map, s, axis=0) - counterpart.corners_map for s in range(4)]
@@ -251,7 +251,7 @@ def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
     span = second - first
     length2 = np.maximum((span**2).sum(axis=1), 1e-18)
     share = np.clip(((points - first) * span).sum(axis=1) / length2, 0.0, 1.0)
-    # Samples more than a step apart are of different lines and are not joined.
+    # Samples more than a step apart belong to different lines and are not joined.
     joined = np.sqrt(length2) <= 1.5 * SAMPLE_STEP_M
     lateral = np.linalg.norm(points - (first + share[:, None] * span), axis=1)
     return np.asarray(np.where(joined, lateral, distance[:, 0]))

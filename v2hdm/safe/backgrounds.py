@@ -158,7 +158,7 @@ def _read(source: Any, part: Any, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _as_bytes(bands: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Bands as 8 bits, from dark to bright, where they are of another kind."""
+    """Bands as 8 bits; other types are stretched from dark to bright."""
     if bands.dtype == np.uint8:
         return bands
     values = bands[:, mask > 0]

@@ -52,9 +52,9 @@ _TEMPORARY = ("TMPDIR", "TEMP", "TMP")  # variables that name the folder of temp
 # Whether a child is a fork: elsewhere than on Linux, libraries of the system may not work in forks.
 _FORKS = sys.platform == "linux"
 _SPARE_BYTES = 2_000_000_000  # memory and largest file of work on the smallest input; chosen
-_TIMES = 10  # by which memory and largest file grow with the input's bytes
+_TIMES = 10  # growth of the memory limit and of the largest file per byte of input
 _STEP_S = 20.0  # processor time of a step of work on the smallest input; chosen
-_STEP_S_PER_MB = 1.0  # by which that grows with the input: the index of a bag is one step
+_STEP_S_PER_MB = 1.0  # growth of that limit with the input, s/MB: indexing a bag is one step
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def in_child(
 
 
 class _Job(NamedTuple):
-    """Work for a child: a function by its name in a module, and what the child has of its parent."""
+    """Work for a child: a function's module and name, and the parent's settings."""
 
     function: str
     arguments: tuple[Any, ...]
@@ -145,7 +145,7 @@ class _ForkServer:
 
     @classmethod
     def idle(cls) -> _ForkServer:
-        """One that was started as it would be now: a waiting one, or a new one."""
+        """A child started under the present settings: a waiting one, or a new one."""
         now = _conditions()
         while True:
             try:
@@ -188,7 +188,7 @@ class _ForkServer:
         self._close()
 
     def forget(self) -> None:
-        """Leave the process to the one that has started it, of which this is a fork."""
+        """End this fork and leave the work to the process that started it."""
         self._process.returncode = 0
         self._close()
 
@@ -269,7 +269,7 @@ def _answer(stream: IO[bytes]) -> tuple[list[Any] | None, int | None]:
 
 
 def _refuse_death(code: int, said: str, limits: Limits, where: str, error: type[V2hdmError]) -> Never:
-    """Raise what a child died of that has given no answer; ``code`` is its exit code or minus a signal."""
+    """Raise the error of a child that died without an answer; ``code`` is its exit code or minus a signal."""
     if resource is not None and code == -signal.SIGXCPU:
         most = f"{limits.step_s:.0f} s of a processor"
         raise error(f"{where}: takes more than {most} for one piece; it is damaged, or a trap")
@@ -343,7 +343,7 @@ def _work(pipe: IO[bytes], module: str, job_bytes: bytes) -> Never:
         message = ("memory",)
     _send(pipe, message)
     sys.stderr.flush()
-    os._exit(0)  # nothing here is worth tidying: threads of libraries might hang
+    os._exit(0)  # no clean-up: threads of libraries might hang
 
 
 def _read(size: int) -> bytes:

@@ -11,13 +11,13 @@ _SPARE_STEPS = 1_000_000  # steps that any query may take beyond those
 
 
 def limit_steps(data: Any, path: Path) -> None:
-    """Let no query of a connection to ``path``, of sqlite3 or apsw, take more than what its bytes need."""
+    """Limit the time of a connection's queries (sqlite3 or apsw) by the bytes of the file ``path``."""
     data.set_progress_handler(lambda: True, _STEPS * path.stat().st_size + _SPARE_STEPS)
 
 
 @contextmanager
 def opened(path: Path, how: str) -> Iterator[sqlite3.Connection]:
-    """A connection to read the file at ``path``; ``how`` is of SQLite's own options."""
+    """Open the file at ``path`` for reading; ``how`` holds SQLite's own options."""
     with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True)) as data:
         limit_steps(data, path)
         yield data

@@ -17,7 +17,7 @@ _HIGHEST_FRAME_M = 12.0  # of a vehicle above the ground, straddle carriers incl
 _LONGEST_DATUM = 200  # letters of a datum's name; chosen
 _LARGEST_PX = 65535  # side of an image: JPEG has no larger one
 _LONGEST_FOCAL_PX = 1e6  # focal length, or offset of the centre, of any camera; chosen
-_ROUNDING = 1e-3  # share by which a covariance may be off for having been rounded
+_ROUNDING = 1e-3  # relative rounding error that a covariance may have
 _MIDDLE = 1.0  # focal lengths from the axis to 45 degrees from it: farther out radial terms prevail
 _WIDEST_RAD = np.deg2rad(89.5)  # rays farther from the axis have no pixel in the pinhole image
 
@@ -67,7 +67,7 @@ def take_origin(content: object, where: str, error: type[V2hdmError]) -> Geodeti
         raise error(f"{where}: latitude must lie within +-90 and longitude within +-180 degrees; fix them")
     datum = take_text(entry.get("datum", "WGS84"), f"{where}, datum", error)
     if not datum.isprintable() or len(datum) > _LONGEST_DATUM:
-        raise error(f"{where}, datum: {shown(datum)} is no name of a datum; give one such as ETRS89")
+        raise error(f"{where}, datum: {shown(datum)} is not the name of a datum; give one such as ETRS89")
     return GeodeticOrigin(
         latitude_deg=latitude_deg,
         longitude_deg=longitude_deg,

@@ -14,7 +14,7 @@ _MOST_BYTES = 4096  # of a placeholder: Linux's longest path (PATH_MAX)
 
 
 def placeholder_words(path: Path) -> str | None:
-    """The kind of placeholder that a file is, and the remedy, for an error's line; None where it is none."""
+    """The kind of placeholder that a file is, and the remedy, for an error line; None for real files."""
     begin = b""
     with suppress(OSError), path.open("rb") as file:
         begin = file.read(_MOST_BYTES + 1)

@@ -36,7 +36,7 @@ def mosaic_points(mosaic: Path, spacing_m: float, most: int, piece_px: int) -> I
 
 
 def ask(work: Any, path: Path, *arguments: Any) -> None:
-    """Do ``work`` on a raster, or on a folder of them, in a child; MapFileError where it dies."""
+    """Run ``work`` on a raster, or on a folder of them, in a child; raises MapFileError if the child dies."""
     files = path.rglob("*") if path.is_dir() else [path]
     limits = Limits.of(files)
     in_child(
@@ -68,7 +68,7 @@ def geotiff(path: Path) -> Iterator[Any]:
 
 
 def _alone(path: Path, folder: Path) -> Path:
-    """A link to a picture in an empty folder, beside links to what says where it lies."""
+    """A link to a picture in an empty folder, beside links to its georeference files."""
     picture = folder / "picture.tif"
     names = {path.name: picture.name, f"{path.name}.aux.xml": f"{picture.name}.aux.xml"}
     names |= {f"{path.stem}{ending}": f"{picture.stem}{ending}" for ending in _WORLD_FILES}

@@ -41,7 +41,7 @@ _CLOSING = [ord("]"), ord("}")]
 
 
 def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> bytes:
-    """The bytes of a plain file, with a warning if it is ours and was changed; raises ``error`` if none."""
+    """The bytes of a plain file, with a warning if we wrote it and it was changed; else raises ``error``."""
     try:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):

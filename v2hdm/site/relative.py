@@ -18,7 +18,9 @@ JointCovariance = Callable[[IntArray], FloatArray]
 """Covariances (P, 2 n, 2 n), m^2, of the stacked corners of P groups (P, n) of corners."""
 
 _NEIGHBOUR_M = 10.0  # distance at which markings are compared, m: a vehicle's length, for manoeuvres
-_FARTHEST_M = 15.0  # largest distance to another marking, m, for a relative standard deviation
+FARTHEST_M = 15.0
+"""Largest distance to another marking, m, for a relative standard deviation."""
+
 _NEIGHBOURS = 4  # largest number of neighbours: with n, their own errors add 1 / 2 n to the sigma, an eighth
 
 
@@ -60,7 +62,7 @@ def with_relative_sigma(
 def neighbours(centres_map: FloatArray) -> Sequence[IntArray]:
     """The others within reach of each point (N, 2), m, the one whose distance is nearest to 10 m first."""
     out = []
-    for k, in_reach in enumerate(cKDTree(centres_map).query_ball_point(centres_map, _FARTHEST_M)):
+    for k, in_reach in enumerate(cKDTree(centres_map).query_ball_point(centres_map, FARTHEST_M)):
         others = np.array([other for other in in_reach if other != k], dtype=np.int64)
         distance_m = np.linalg.norm(centres_map[others] - centres_map[k], axis=1)
         out.append(others[np.argsort(np.abs(distance_m - _NEIGHBOUR_M), kind="stable")])

@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 from scipy.stats import chi2
 
@@ -49,6 +50,8 @@ _ELONGATED = 2.0
 """Ratio of length to width from which paint is rolled by the metre: common width, individual length."""
 
 _GAUSS_NEWTON_STEPS = 3  # steps that refine a laid shape
+
+_COMPARED_AT_ONCE = 500  # candidates that are compared with all at once, which bounds the memory; chosen
 
 
 @dataclass(frozen=True)
@@ -210,10 +213,7 @@ def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
     pairs = 0.5 * (side[:, :2] + side[:, 2:]), diagonals
     lengths = np.concatenate([np.sort(pair, axis=1) for pair in pairs], axis=1)
     limit_m = np.maximum(MEMBER_M, _MEMBER_SHARE * lengths.max(axis=1))
-    difference_m = np.abs(lengths[:, None] - lengths[None]).max(axis=2)
-    typical = int(
-        np.argmax((difference_m <= limit_m[:, None]).sum(axis=1) - difference_m.mean(axis=1) / limit_m)
-    )
+    typical = _most_typical(lengths, limit_m)
     shape = parallelograms(candidates.corners_map[typical])
     members = np.zeros(len(candidates), dtype=bool)
     for _ in range(2):
@@ -224,6 +224,19 @@ def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
             break
         shape = parallelograms(np.median(laid.in_frame_of_shape(candidates.corners_map)[members], axis=0))
     return shape, members
+
+
+def _most_typical(lengths: FloatArray, limit_m: FloatArray) -> int:
+    """The candidate within whose limit (N,), m, in each of its ``lengths`` (N, 4) the most others are.
+
+    Of these it is the one that differs least from all, in limits.
+    """
+    typicality = np.empty(len(lengths))
+    for rows in np.array_split(np.arange(len(lengths)), -(-len(lengths) // _COMPARED_AT_ONCE)):
+        difference_m = cdist(lengths[rows], lengths, "chebyshev")
+        alike = (difference_m <= limit_m[rows, None]).sum(axis=1)
+        typicality[rows] = alike - difference_m.mean(axis=1) / limit_m[rows]
+    return int(np.argmax(typicality))
 
 
 class _Deviations(NamedTuple):

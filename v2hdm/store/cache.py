@@ -111,7 +111,7 @@ def key_of(*parts: object) -> str:
 
 @cache
 def code_key() -> str:
-    """Key of this package's files and of the versions of what it computes with: any change makes anew."""
+    """The key of this package's files and its libraries' versions: any change invalidates entries."""
     files = sorted(path for path in _PACKAGE.rglob("*") if path.suffix in _CODE)
     content = [(path.relative_to(_PACKAGE).as_posix(), file_digest(path)) for path in files]
     return key_of(content, library_versions())
@@ -143,14 +143,14 @@ class StageCache:
         self._resume = resume
         self._can_write = folder is not None
         self.hits: list[str] = []
-        """Stages whose entries were there."""
+        """Stages that were read from the cache."""
 
     def in_use(self) -> AbstractContextManager[None]:
-        """Protect from pruning what is read or written within this block."""
+        """Protect entries that are read or written within this block from pruning."""
         return nullcontext() if self.folder is None else in_use(self.folder)
 
     def key(self, *parts: object) -> str:
-        """The key of what this version of the code makes of ``parts``."""
+        """The key of this code version's result for the inputs ``parts``."""
         return key_of(code_key(), *parts)
 
     def path(self, stage: str, key: str) -> Path:
@@ -166,7 +166,7 @@ class StageCache:
         return self.put(stage, key, kind, value, lines)
 
     def get(self, stage: str, key: str, kind: type[_Value]) -> _Value | None:
-        """The entry of a stage under ``key``; None where there is none that is whole."""
+        """The entry of a stage under ``key``; None if it is missing or damaged."""
         path = self.path(stage, key)
         if not self._resume or self.folder is None or not path.is_file():  # a pipe would be waited for
             return None
@@ -193,7 +193,7 @@ class StageCache:
     def put(
         self, stage: str, key: str, kind: type[_Value], value: _Value, lines: list[Line] | None = None
     ) -> _Value:
-        """Keep ``value`` under ``key`` and return it as :meth:`get` will; a warning where it cannot."""
+        """Store ``value`` under ``key`` and return it as :meth:`get` will; warn if it cannot be stored."""
         content = encode(value)
         path = self.path(stage, key)
         partial = path.with_name(f".{HOST}-{secrets.token_hex(8)}.part")
@@ -217,7 +217,7 @@ class StageCache:
 
 
 def checked(data: bytes) -> bytes | None:
-    """The content of an entry's file, None where it is damaged."""
+    """The content of an entry's file; None if it is damaged."""
     content = data[_START:]
     return content if data[:_START] == _HEAD + hashlib.sha256(content).digest() else None
 
@@ -268,7 +268,7 @@ class Item:
 
 
 def items_of(cache: Path) -> list[Item]:
-    """Everything that is ours in a cache, the least recently used first."""
+    """All our items in a cache, the least recently used first."""
     items = []
     for path in (cache / STAGES).glob("*/*"):
         kind = path.parent.name if _ENTRY.fullmatch(path.name) else LEFT
@@ -310,7 +310,7 @@ def prune(cache: Path, limit: float) -> list[Item]:
 
 
 def prune_to_limit(cache: Path, limit_gb: float) -> None:
-    """Prune a cache to a limit in GB, and log what went."""
+    """Prune a cache to a limit in GB, and log the removed items."""
     removed = prune(cache, limit_gb * 1e9)
     if removed:
         size_gb = sum(item.size for item in removed) / 1e9

@@ -63,7 +63,7 @@ def take_lock(stream: IO[str]) -> bool:
 
 @contextmanager
 def waited_for(path: Path) -> Iterator[None]:
-    """Hold the lock ``path``, a file that is there meanwhile; ConfigError where others hold it for long."""
+    """Hold the lock file ``path`` within this block; raises ConfigError if others hold it for long."""
     end_s = time.monotonic() + _LONGEST_WAIT_S
     while True:
         stream = path.open("a+", encoding="utf-8")
@@ -84,7 +84,7 @@ def waited_for(path: Path) -> Iterator[None]:
 
 @contextmanager
 def in_use(cache: Path) -> Iterator[None]:
-    """Protect from pruning what is used in a cache within this block, if anything can be written there."""
+    """Protect entries of a writable cache that are used within this block from pruning."""
     path = cache / IN_USE / f"{secrets.token_hex(8)}{_ENDING}"
     here = cache.resolve()
     stream = None
@@ -136,9 +136,7 @@ _ABOUT = "files that v2hdm wrote here, which it may remove to make room; touched
 
 _VERSION = 3  # raised whenever an import comes out as other files
 _IMAGES = (".png", ".jpg", ".jpeg")  # endings of files that are listed without a digest
-_WRITER = (
-    f"{HOST}-{secrets.token_hex(4)}"  # this process in names of unfinished files: its host and 8 hex digits
-)
+_WRITER = f"{HOST}-{secrets.token_hex(4)}"  # this process in unfinished files' names
 _STALE_S = 3600.0  # time without a write after which an unfinished folder counts as left by a killed run, s
 
 
@@ -156,13 +154,13 @@ def note_use(folder: Path) -> None:
 
 
 def size_of(folder: Path) -> int | None:
-    """Bytes of our files in a folder, as its list says; None where it is none of our folders."""
+    """The bytes of our files in a folder, from its list; None for other folders."""
     size = _listed(folder).get("bytes")
     return size if isinstance(size, int) and size >= 0 else None
 
 
 def remove_ours(folder: Path) -> None:
-    """Remove our files from a folder, those at its top first, and what is empty then. Raises OSError."""
+    """Remove our files from a folder, top level first, then empty folders. Raises OSError."""
     for path in sorted(_ours(folder), key=lambda path: (len(path.parts), path)):
         path.unlink(missing_ok=True)
     (folder / LIST).unlink(missing_ok=True)
@@ -179,7 +177,7 @@ def remove_empty(folder: Path) -> None:
 
 
 def bring_over(old: Path, new: Path, is_ours: Callable[[str], bool]) -> None:
-    """Give what is not ours in the ``old`` folder, as names within it say, to the ``new`` one as well."""
+    """Carry the files of others in the ``old`` folder over to the ``new`` one."""
     for root, folders, files in os.walk(old):
         here = Path(root)
         links = [name for name in folders if (here / name).is_symlink()]
@@ -255,7 +253,7 @@ def is_whole(folder: Path) -> bool:
 
 @contextmanager
 def new_entry(folder: Path) -> Iterator[Path]:
-    """A hidden folder to fill, which becomes the entry ``folder``, whole; DriveError where it cannot."""
+    """A hidden folder to fill, then moved to ``folder`` as a whole; raises DriveError if it cannot be."""
     partial = folder.with_name(f".{folder.name}.{_WRITER}.part")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -66,7 +66,7 @@ def is_as_written(path: Path, data: bytes) -> bool:
 
 
 def _digests(path: Path) -> set[str]:
-    """The digests of what we wrote to a file, by the list of its result; empty where none lists it."""
+    """The digests of the content that we wrote to a file, from its result's list; empty if unlisted."""
     folder = next((parent for parent in path.parents[:_DEEPEST] if (parent / LIST).is_file()), None)
     if folder is None:
         return set()
@@ -80,7 +80,7 @@ def _digests(path: Path) -> set[str]:
 
 
 def warn_if_changed(path: Path, data: bytes) -> None:
-    """Warn, once, of a file of a result that holds other ``data`` than we wrote; it is read all the same."""
+    """Warn once if a result's file holds other ``data`` than we wrote; it is still read."""
     with suppress(OSError, RuntimeError):
         path = path.resolve()
         digest = hashlib.sha256(data).hexdigest()

@@ -70,7 +70,7 @@ def _growing(path: Path) -> Iterator[TextIO]:
 
 @contextmanager
 def _at_once(path: Path) -> Iterator[TextIO]:
-    """A file without a name to write to, whose content then becomes that of ``path``."""
+    """An unnamed file to write to; its content then replaces that of ``path``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile("w+", encoding="utf-8", dir=path.parent) as stream:
         yield stream

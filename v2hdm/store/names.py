@@ -33,7 +33,7 @@ TRAJECTORIES = "trajectory*.tum"  # the pattern of these and of :func:`trajector
 
 
 def map_file(path: Path) -> Path:
-    """The map of the result folder ``path``, or ``path`` itself where it is no folder."""
+    """The map file of the result folder ``path``, or ``path`` itself if it is a file."""
     return path / MAP if path.is_dir() else path
 
 

@@ -63,7 +63,7 @@ class RemoteFile:
 
 
 class RemoteFolder:
-    """The objects below one URL, by their names there; what fails is a :class:`ConfigError` with the URL."""
+    """The objects below one URL, by name; a failure is a :class:`ConfigError` that names the URL."""
 
     def __init__(self, files: Any, root: str, url: str, option: str) -> None:
         """``files`` is the file system of fsspec, ``root`` the path of ``url`` there."""
@@ -143,13 +143,13 @@ class RemoteFolder:
         return listed
 
     def remove(self, name: str) -> None:
-        """Remove an object, if it is there."""
+        """Remove an object if it exists."""
         with self._asked(name), suppress(FileNotFoundError, KeyError):  # the latter of the store in memory
             self._files.rm_file(f"{self._root}/{name}")
 
     @contextmanager
     def _asked(self, name: str = "", in_bucket: bool = False) -> Iterator[None]:
-        """Turn errors within into one line; that an object exists, or is missing, is raised as it is."""
+        """Turn errors within into one line, except that an object exists or is missing."""
         try:
             yield
         except FileExistsError:
@@ -194,7 +194,7 @@ class _Entry:
 
 
 def is_whole_at(place: RemoteFolder) -> bool:
-    """Whether there is a finished result at a store whose objects are all there as they were put."""
+    """Whether a store holds a finished result with all its objects unchanged."""
     listing = place.read(LIST)
     if listing is None:
         return False
@@ -289,7 +289,7 @@ def _listing(entries: Iterable[_Entry], writer: str = "") -> bytes:
 
 
 def _foreign(place: RemoteFolder, name: str) -> ConfigError:
-    return ConfigError(f"{place}/{name}: is no object of ours; move it, or give another place")
+    return ConfigError(f"{place}/{name}: was not written by V2HDM; move it, or give another place")
 
 
 def _digest(data: bytes) -> str:

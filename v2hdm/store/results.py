@@ -34,7 +34,7 @@ class _Target:
     """A folder of results, and the option of the command that names it in errors."""
 
     def __init__(self, shown: Path, option: str) -> None:
-        """Resolve ``shown``; refuse what is no folder before any work."""
+        """Resolve ``shown``; refuse anything but a folder before any work."""
         refuse_url(shown)
         self.shown = shown
         self.option = option
@@ -287,7 +287,7 @@ def listed_files(folder: Path, option: str, maker: str) -> Iterator[Callable[[Pa
 
 @contextmanager
 def growing_folder(folder: Path, option: str, maker: str = "") -> Iterator[WriteFile]:
-    """Yield what writes a named file into ``folder``, listed first; errors as :func:`listed_files`."""
+    """Yield a writer of named files into ``folder``, each listed first; errors as :func:`listed_files`."""
     with _locked(folder, option) as output:
         target = output.path
 
@@ -321,7 +321,7 @@ def _locked(folder: Path, option: str) -> Iterator[_Target]:
 
 @contextmanager
 def locked_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
-    """Where ``folder`` leads, which no other process of ours writes within this block; else ConfigError."""
+    """The resolved ``folder``, locked against our other processes within this block; else ConfigError."""
     with _locked(folder, option) as output:
         yield output.path
 
@@ -332,7 +332,7 @@ def files_of_result(folder: Path) -> dict[str, str]:
 
 
 def is_whole(folder: Path, files: Mapping[str, str]) -> bool:
-    """Whether a result folder holds these files of ours, unchanged, and none is missing."""
+    """Whether a result folder holds all of these files, unchanged."""
     return bool(files) and all(
         (folder / name).is_file() and file_digest(folder / name) == digest for name, digest in files.items()
     )

@@ -1,4 +1,4 @@
-"""Which corner of a map each surveyed point is of.
+"""Match surveyed points with the corners of a map.
 
 The map may lie off by more than its paint is wide: a dash is 12 cm wide, and a receiver drifts by as much, so
 that the nearest corner may be the wrong one. But neighbouring corners have like errors, so that one match
@@ -55,7 +55,7 @@ def match(
 
 
 class _Choice(NamedTuple):
-    """A point and the corner that it is of."""
+    """A surveyed point and its corner."""
 
     point: int
     rank: int  # which of the point's corners

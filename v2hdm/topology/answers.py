@@ -52,7 +52,7 @@ class Answer:
             speed_kmh = float("nan")
         if not 0.0 < speed_kmh < _FASTEST_KMH:
             raise MapFileError(
-                f"{self.where}: {self.answer!r} is no speed in km/h; give a number, such as 30"
+                f"{self.where}: {self.answer!r} is not a speed in km/h; give a number, such as 30"
             )
         return speed_kmh
 
@@ -75,7 +75,7 @@ def stated_directions(
             continue
         if answer.answer not in WAYS or answer.to_map is None:
             raise MapFileError(
-                f"{answer.where}: {answer.answer!r} is no direction; give along, against or both"
+                f"{answer.where}: {answer.answer!r} is not a direction; give along, against or both"
             )
         number = _lane_at(shapes, answer)
         shape = shapes[number]
@@ -103,7 +103,7 @@ def _lane_at(shapes: Sequence[LaneShape], answer: Answer) -> int:
 
 
 def stated_pair(shapes: Sequence[LaneShape], answer: Answer) -> tuple[int, int]:
-    """The lanes between which a way is stated: one that ends at its place, one that starts where it leads."""
+    """The two lanes that a stated way connects: one ends at its place, one starts where it leads."""
     if answer.to_map is None:
         raise MapFileError(f"{answer.where}: it has one place; draw a line from the end of a lane to a start")
     ends = np.array([shape.centre[-1] for shape in shapes]).reshape(-1, 2)

@@ -21,7 +21,7 @@ class Direction(Enum):
     STATED = "stated"
     """A person said so."""
     DRAWN = "drawn"
-    """Its lines run that way, and no path of a drive is known at all."""
+    """The direction of its lines; no path of any drive is known."""
     ASKED = "asked"
     """Nothing: drives are known, and none went along it."""
 

@@ -91,7 +91,7 @@ class _Groups:
 
 
 def turn_rad(centre: FloatArray) -> float:
-    """The angle, rad, by which a lane turns from its start to its end, to the left; beyond pi for loops."""
+    """The angle, rad, that a lane turns to the left from start to end; beyond pi for loops."""
     steps = np.diff(centre, axis=0)
     steps = steps[np.linalg.norm(steps, axis=1) > 1e-6]
     turns = np.arctan2(cross(steps[:-1], steps[1:]), (steps[:-1] * steps[1:]).sum(axis=1))

@@ -22,7 +22,7 @@ class UsableLines(NamedTuple):
 
 
 def usable_lines(lanes: Sequence[Lane]) -> UsableLines:
-    """The lines of a map without those that cross themselves: nobody can say what lies beside these."""
+    """The lines of a map without those that cross themselves, whose sides are undefined."""
     lines = []
     questions = []
     for number, lane in enumerate(lanes):

@@ -11,9 +11,7 @@ from tests.topology.scenes import LANES
 from v2hdm.records import FloatArray
 
 _BESIDE_M = 0.3  # distance, m, of paint from where a lane's border truly runs: half a line and a taper
-_REACH_M = (
-    6.0  # farthest that a line of dashes ends before the line that it is painted along, m: dash and gap
-)
+_REACH_M = 6.0  # a line of dashes may end this far, m, before its line: a dash and a gap
 
 Place = tuple[float, float]
 Pair = tuple[Place, Place]

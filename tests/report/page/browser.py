@@ -24,7 +24,7 @@ class Watched:
 def browser_path() -> str:
     """Where Chromium is; the test is skipped where there is none, or no playwright."""
     pytest.importorskip("playwright", reason="no playwright: pip install playwright")
-    path = next((found for found in map(shutil.which, BROWSERS) if found), None)
+    path = next((executable for executable in map(shutil.which, BROWSERS) if executable), None)
     if path is None:
         pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is installed")
     return path

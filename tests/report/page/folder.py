@@ -75,13 +75,13 @@ GONE = (DIAMOND_M + np.array([4.5, 1.2])).tolist()
 
 def changes() -> dict[str, object]:
     """As ``metrics.json`` lists them: the first marking has come 30 cm north, another one is gone."""
-    seen = {"class": DIAMOND, "probability": 0.99, "found": 0, "views": 7}
+    sighted = {"class": DIAMOND, "probability": 0.99, "found": 0, "views": 7}
     now = DIAMOND_M + PLACES[0]
     before = (now - np.array([0.0, 0.3])).tolist()
     moved = {"id": 1, "fate": "moved", "before_map": before, "after_map": now.tolist()}
     gone = {"id": 9, "fate": "vanished", "before_map": GONE, "after_map": None}
     by = {"shift_m": [0.0, 0.3], "shift_sigma_m": [0.01, 0.01]}
-    return {"listed": [{**seen, **moved, **by}, {**seen, **gone, **dict.fromkeys(by)}]}
+    return {"listed": [{**sighted, **moved, **by}, {**sighted, **gone, **dict.fromkeys(by)}]}
 
 
 def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: str = "PASS") -> Drive:
@@ -106,7 +106,7 @@ def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: 
         suspicious = [(2, 3e-5, 1e-5, 0.4, 0.2, 0.25), (99, 1.0, 1.0, 1.0, 1.0, 0.0)]
         figures = {
             "markings": len(hd_map.markings), "reprojection_rmse_px": 0.36, "lanes": {"length_m": 12.0},
-            "suspicious": [dict(zip(columns, one, strict=True)) for one in suspicious],
+            "suspicious": [dict(zip(columns, row, strict=True)) for row in suspicious],
         }  # fmt: skip
         metrics = {
             "name": name, "version": "0.1.0", "date": "2026-11-23", "verdict": verdict(status),
@@ -146,14 +146,14 @@ def _write_drive(
 
 def _residuals(drive: Drive, hd_map: HDMap, poses: np.ndarray, cam_from_vehicle: np.ndarray) -> Residuals:
     """All corners in all images, each :data:`SHIFT_PX` off."""
-    rows, seen = [], []
+    rows, observed_px = [], []
     for i, pose in enumerate(poses):
         for j, marking in enumerate(hd_map.markings):
             px, _ = project_ground(
                 INFO.intrinsic, cam_from_vehicle @ np.linalg.inv(pose), marking.corners_map
             )
             rows += [(i, j + 1, c) for c in range(4)]
-            seen += list(px - SHIFT_PX)
+            observed_px += list(px - SHIFT_PX)
     table, count = np.array(rows), len(rows)
     return Residuals(
         image=tuple(image.path.relative_to(drive.root).as_posix() for image in drive.images),
@@ -163,7 +163,7 @@ def _residuals(drive: Drive, hd_map: HDMap, poses: np.ndarray, cam_from_vehicle:
         marking=table[:, 1],
         corner=table[:, 2],
         is_point=np.ones(count, dtype=bool),
-        observed_px=np.array(seen),
+        observed_px=np.array(observed_px),
         residual_px=np.tile(SHIFT_PX, (count, 1)),
         distance_sigma=np.full(count, 1.2),
     )

@@ -149,8 +149,8 @@ def test_the_outline_lies_on_the_paint_of_its_picture(browser, report):
         )
         assert min(brightness["inside"]) > 180
         assert max(brightness["out"]) < 140
-        seen, mapped = np.array(shots[0]["seen"]), np.array(shots[0]["map"])
-        assert np.abs(np.sort(seen[:, 0]) - np.sort(mapped[:, 0])).max() < 1.0
+        outline_px, mapped = np.array(shots[0]["seen"]), np.array(shots[0]["map"])
+        assert np.abs(np.sort(outline_px[:, 0]) - np.sort(mapped[:, 0])).max() < 1.0
 
 
 def test_what_was_left_out_tells_its_reason_and_a_number_finds_its_marking(browser, report):

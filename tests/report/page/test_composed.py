@@ -30,10 +30,10 @@ def test_areas_double_lines_and_varieties_are_in_the_page_s_map(tmp_path, monkey
     shown = layers(read_facts(tmp_path / "result", drive), None)
     kinds = shown["kinds"]
     assert kinds == ["crosswalk", "crosswalk_bar", "stop_line", "text", "lane_dash", "lane_line"]
-    assert [one.get("kind") for one in shown["markings"]] == ["give_way", None, None, None, None]
-    by_kind = {kinds[one["k"]]: one for one in shown["symbols"]}
+    assert [marking.get("kind") for marking in shown["markings"]] == ["give_way", None, None, None, None]
+    by_kind = {kinds[symbol["k"]]: symbol for symbol in shown["symbols"]}
     assert by_kind["crosswalk"]["parts"] == [2, 3, 4, 5]
-    assert all(one["area"] for one in by_kind.values())
+    assert all(symbol["area"] for symbol in by_kind.values())
     # A double line is one line, drawn as the two that are painted.
     assert shown["lane_lines"] == 1
     assert sorted(kinds[line["k"]] for line in shown["lanes"]) == ["lane_dash", "lane_line"]

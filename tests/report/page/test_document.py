@@ -39,7 +39,9 @@ def make_survey(folder):
         hd_map = read_geojson(result / "map.geojson")
         Context().run(write_geojson, replace(hd_map, origin=HAMBURG), result / "map.geojson", None)
         write_job(result, StatedJob(JOB))
-        mountings = {name: one.calibration.cam_from_vehicle for name, one in read_cameras(result).items()}
+        mountings = {
+            name: camera.calibration.cam_from_vehicle for name, camera in read_cameras(result).items()
+        }
         write_coverage(result, coverage_of(dated, mountings))
     return result, dated
 
@@ -101,7 +103,9 @@ def test_what_nobody_has_stated_says_so(tmp_path):
     page = document(read_facts(tmp_path / "result", drive))
     survey = dict(page.identity.survey)
     assert {survey[name] for name in ("Site", "Client", "Operator", "Receiver")} == {"not stated"}
-    assert survey["Date of the drive"] == ("not stated: the drive's times are no dates, but 10.0 s to 10.8 s")
+    assert survey["Date of the drive"] == (
+        "not stated: the drive's times are not dates, but 10.0 s to 10.8 s"
+    )
     assert survey["RTK-fixed positions"].startswith("not stated")
     system = dict(page.identity.system)
     assert "whose place on the earth the drive does not state" in system["Horizontal CRS"]

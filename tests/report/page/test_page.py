@@ -74,9 +74,9 @@ def test_suspicious_markings_are_listed_with_their_reason_and_pictures(page):
 
 def test_an_ellipse_has_the_half_axes_and_the_direction_of_its_covariance():
     turned = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
-    one = turned @ np.diag([0.02**2, 0.01**2]) @ turned.T
+    covariance_m2 = turned @ np.diag([0.02**2, 0.01**2]) @ turned.T
     unknown = Marking(DIAMOND, DIAMOND_M, 3)
-    none, half = ellipses([unknown, Marking(DIAMOND, DIAMOND_M, 3, np.kron(np.eye(4), one))])
+    none, half = ellipses([unknown, Marking(DIAMOND, DIAMOND_M, 3, np.kron(np.eye(4), covariance_m2))])
     assert np.isnan(none).all()
     # 5.991 is the 95 % quantile of chi-square with two degrees of freedom.
     assert half[:, :2] == pytest.approx(np.tile(np.sqrt(5.991) * np.array([0.02, 0.01]), (4, 1)), rel=1e-3)
@@ -92,9 +92,9 @@ def test_the_stated_ellipses_hold_95_of_100_true_corners_of_right_covariances(re
     sigma_m = 0.01
     true = [Marking(DIAMOND, DIAMOND_M + place, 3) for place in places]
     mapped = [
-        replace(one, corners_map=one.corners_map + random.normal(0, sigma_m, (4, 2)),
+        replace(marking, corners_map=marking.corners_map + random.normal(0, sigma_m, (4, 2)),
                 covariance_m2=sigma_m**2 * np.eye(8))
-        for one in true
+        for marking in true
     ]  # fmt: skip
     facts = replace(
         read_facts(result, drive),
@@ -106,13 +106,13 @@ def test_the_stated_ellipses_hold_95_of_100_true_corners_of_right_covariances(re
 
 
 def test_key_figures_and_tables_state_what_the_files_do(page):
-    figures = {one.name: (one.value, one.unit) for one in page.figures}
+    figures = {figure.name: (figure.value, figure.unit) for figure in page.figures}
     assert figures["Markings"] == ("4", "")
     assert figures["From marking to marking"] == ("1.0", "cm")  # 2.45 x 0.004 m
     assert figures["In the map’s frame"] == ("2.5", "cm")  # 2.451 x 0.01 m
     assert figures["In the images"] == ("0.36", "px")
     assert figures["Accuracy A"] == ("3", "of 5")
-    note = next(one.note for one in page.figures if one.name == "Accuracy A")
+    note = next(figure.note for figure in page.figures if figure.name == "Accuracy A")
     assert note == "within the accuracy goal; besides, 1 B, 1 C"
     mounting = {row[0]: row[1:] for row in page.cameras[0].mounting.rows}
     assert mounting["centre up"][:2] == ["2.000 m", "2.0 mm"]
@@ -124,24 +124,24 @@ def test_key_figures_and_tables_state_what_the_files_do(page):
 
 
 def test_residuals_on_the_ground_lead_from_the_observation_to_the_map(result, drive):
-    found = ground_residuals(read_facts(result, drive))
-    assert found.residual_px == pytest.approx(np.tile(SHIFT_PX, (80, 1)), abs=1e-4)
+    residuals = ground_residuals(read_facts(result, drive))
+    assert residuals.residual_px == pytest.approx(np.tile(SHIFT_PX, (80, 1)), abs=1e-4)
     # Straight ahead 0.3 px to the right are depth / 500 px times as many metres to the vehicle's right.
-    ahead = np.isin(found.marking, (1, 4)) & (found.corner % 2 == 0)
-    depth_m = np.cos(0.25) * found.range_m + np.sin(0.25) * 2.0
-    assert found.ground_m[ahead, 1] == pytest.approx(-0.3 * depth_m[ahead] / 500, rel=0.02)
-    assert (found.ground_m[ahead, 0] > 0).all()  # 0.2 px up is farther away
-    assert found.range_m.max() == pytest.approx(9.5, abs=0.1)
+    ahead = np.isin(residuals.marking, (1, 4)) & (residuals.corner % 2 == 0)
+    depth_m = np.cos(0.25) * residuals.range_m + np.sin(0.25) * 2.0
+    assert residuals.ground_m[ahead, 1] == pytest.approx(-0.3 * depth_m[ahead] / 500, rel=0.02)
+    assert (residuals.ground_m[ahead, 0] > 0).all()  # 0.2 px up is farther away
+    assert residuals.range_m.max() == pytest.approx(9.5, abs=0.1)
 
 
 def test_pictures_stay_within_their_budget_and_the_best_of_everything_comes_first(result, drive, monkeypatch):
     facts = read_facts(result, drive)
     everything = pictures.pictures(facts, pictures.BUDGET_BYTES)
     assert {"m1", "m2", "m3", "m4", "s6", "x0"} <= everything.keys()
-    total = sum(len(one["src"]) for shots in everything.values() for one in shots)
+    total = sum(len(picture["src"]) for shots in everything.values() for picture in shots)
     monkeypatch.setattr(pictures, "_USUAL_BYTES", 1)
     fewer = pictures.pictures(facts, total // 2)
-    assert sum(len(one["src"]) for shots in fewer.values() for one in shots) <= total // 2
+    assert sum(len(picture["src"]) for shots in fewer.values() for picture in shots) <= total // 2
     assert all(shots[0] == everything[key][0] for key, shots in fewer.items())
     assert len([key for key in fewer if key.startswith("m")]) == 4
 
@@ -217,7 +217,7 @@ def test_check_points_of_the_folder_are_told_in_centimetres_and_shown_on_the_map
     page = document(read_facts(tmp_path / "result", drive))
     first = dict(zip(page.check_points.headings, page.check_points.rows[0], strict=True))
     assert (first["point"], first["east (cm)"], first["north (cm)"]) == ("P1", "1.2", "−0.4")
-    assert [one["off"] for one in page.map_data["checks"]] == [[0.0123, -0.004], [None, None]]
+    assert [check["off"] for check in page.map_data["checks"]] == [[0.0123, -0.004], [None, None]]
 
 
 def test_what_changed_since_an_earlier_map_is_a_layer_of_the_map(page):
@@ -309,7 +309,7 @@ def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(resu
     write_empty(tmp_path / "huge.tif", crs="EPSG:32632")
     facts = read_facts(result, None)
     placed = replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG))
-    for name, of, told in (
+    for name, of, reason in (
         ("elsewhere", placed, "does not cover this map"),
         ("none", placed, "not a readable GeoTIFF"),
         ("pipe", placed, "not a readable GeoTIFF or folder of XYZ tiles; check"),
@@ -317,7 +317,7 @@ def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(resu
         ("aerial", facts, "no position on the earth"),
         ("huge", placed, "more pixels than its bytes could hold"),
     ):
-        with pytest.raises(MapFileError, match=f"{name}.tif: .*{told}"):
+        with pytest.raises(MapFileError, match=f"{name}.tif: .*{reason}"):
             background_layer(tmp_path / f"{name}.tif", of)
 
 
@@ -344,8 +344,8 @@ def test_a_report_made_again_keeps_the_background_of_the_one_before(tmp_path, mo
     monkeypatch.setattr(document_module.charts, "residual_charts", lambda *_: {})
     for background in (tmp_path / "aerial.tif", None):
         text = write_page(tmp_path / "result", None, background).read_text()
-        (found,) = re.findall(r'id="map-data">(.*?)</script>', text)
-        assert json.loads(found)["background"] == shown
+        (map_data,) = re.findall(r'id="map-data">(.*?)</script>', text)
+        assert json.loads(map_data)["background"] == shown
 
 
 def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(tmp_path, monkeypatch):
@@ -355,8 +355,8 @@ def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(tmp_path, monkeypat
     random = np.random.default_rng(0).integers(0, 255, (600, 800, 4), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "result" / "mosaic.webp"), random)
     cv2.imwrite(str(tmp_path / "result" / "mosaic_before_after.png"), random[..., :3])
-    told = {"image": "mosaic.webp", "bounds_m": [-1.0, -4.0, 15.0, 8.0]}
-    write_json(tmp_path / "result" / "mosaic.json", told)
+    mosaic = {"image": "mosaic.webp", "bounds_m": [-1.0, -4.0, 15.0, 8.0]}
+    write_json(tmp_path / "result" / "mosaic.json", mosaic)
     monkeypatch.setattr(ground, "LARGEST_BYTES", 60_000)
     page = document(read_facts(tmp_path / "result", drive))
     layer = page.map_data["mosaic"]

@@ -139,21 +139,21 @@ def test_what_is_undone_is_out_of_the_file_and_in_it_again_when_done_again(brows
 
 def test_what_another_editor_corrects_is_shown_and_neither_loses_anything(browser, served):
     address, _, path = served
-    with opened(browser, address) as one, opened(browser, address) as other:
-        for watched in (one, other):
+    with opened(browser, address) as first, opened(browser, address) as other:
+        for watched in (first, other):
             ready(watched.page)
-        press(one.page, "n Delete")
-        saved(one.page, 1)
+        press(first.page, "n Delete")
+        saved(first.page, 1)
         other.page.evaluate("window.v2hdmView.edits.look(true)")
         saved(other.page, 1)
         press(other.page, "q a")
         saved(other.page, 2)
         # The same marking, before the other's page has shown it.
-        one.page.evaluate("window.v2hdmView.edits.look = async () => undefined")
+        first.page.evaluate("window.v2hdmView.edits.look = async () => undefined")
         press(other.page, "n n Delete")
         saved(other.page, 3)
-        press(one.page, "n a")
-        one.page.locator("#saved.problem", has_text="corrected elsewhere meanwhile").wait_for()
+        press(first.page, "n a")
+        first.page.locator("#saved.problem", has_text="corrected elsewhere meanwhile").wait_for()
         assert [correction.says for correction in read_corrections(path)] == [
             "rejected",
             "accepted",

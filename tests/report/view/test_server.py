@@ -52,7 +52,7 @@ def test_other_pages_other_names_and_guesses_are_refused(served):
     )
     assert (status, "expected one of accepted, rejected, corrected, added" in said) == (400, True)
     assert ask(address, "POST", place, sent, Origin=f"http://{parts.netloc}")[0] == 200
-    assert [one.says for one in read_corrections(path)] == ["rejected"]
+    assert [correction.says for correction in read_corrections(path)] == ["rejected"]
 
 
 def test_nobody_on_another_machine_can_ask(tmp_path):
@@ -82,7 +82,7 @@ def test_a_signal_ends_it_in_one_line_and_what_was_said_before_is_gone_on_with(t
         said, failed = process.communicate(timeout=30)
     line = f"2 corrections in {path}: map.corrections={path} in the next run\n"
     assert (process.returncode, said, failed) == (0, line, "")
-    assert [one.says for one in read_corrections(path)] == ["accepted", "rejected"]
+    assert [correction.says for correction in read_corrections(path)] == ["accepted", "rejected"]
 
 
 OUTLINE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
@@ -125,7 +125,7 @@ def test_two_views_of_one_file_keep_what_both_have_said(served):
             thread.start()
         for thread in threads:
             thread.join()
-        places = {round(one.outline_map[0][0]) for one in read_corrections(path)}
+        places = {round(correction.outline_map[0][0]) for correction in read_corrections(path)}
         assert places == {10 * number for number in range(16)}
     assert not list(path.parent.glob(".*.lock"))
 
@@ -136,12 +136,12 @@ def test_two_who_correct_the_same_marking_do_not_overwrite_each_other(served):
         assert send(other, entry_at(0, reason="a shadow"))[0] == 200
         status, said = send(address, entry_at(0, says="accepted"))
         assert (status, "this was corrected elsewhere meanwhile; reload the page" in said) == (409, True)
-        assert [one.says for one in read_corrections(path)] == ["rejected"]
+        assert [correction.says for correction in read_corrections(path)] == ["rejected"]
         assert ask(address, "GET", "")[0] == 200
         assert send(address, entry_at(0, says="accepted"), before=None)[0] == 409  # from a page of before
         before = entry_at(0, reason="a shadow")
         assert send(address, entry_at(0, says="accepted"), before=before)[0] == 200
-    assert [one.says for one in read_corrections(path)] == ["accepted"]
+    assert [correction.says for correction in read_corrections(path)] == ["accepted"]
 
 
 def test_a_file_that_a_person_edits_meanwhile_is_not_overwritten_before_the_page_shows_it(served):
@@ -154,7 +154,7 @@ def test_a_file_that_a_person_edits_meanwhile_is_not_overwritten_before_the_page
     assert path.read_text() == f"# mine\n{by_hand}"
     ask(address, "GET", "")
     assert send(address, entry_at(5))[0] == 200
-    assert [round(one.outline_map[0][0]) for one in read_corrections(path)] == [0, 30, 50]
+    assert [round(correction.outline_map[0][0]) for correction in read_corrections(path)] == [0, 30, 50]
     path.write_text("corrections: [")
     assert send(address, entry_at(6))[0] == 400
     assert path.read_text() == "corrections: ["
@@ -215,7 +215,7 @@ def test_what_is_kept_is_read_again_whatever_its_letters_are(served):
     for number, reason in enumerate(reasons):
         status, _ = send(address, entry_at(number, reason=reason))
         assert len(read_corrections(path)) == number + 1 if status == 200 else status == 400
-    assert {one.reason for one in read_corrections(path)} >= {"---\n...", "\U0001f600"}
+    assert {correction.reason for correction in read_corrections(path)} >= {"---\n...", "\U0001f600"}
 
 
 def test_no_page_may_frame_ours(served):
@@ -249,7 +249,7 @@ def test_a_reader_who_hangs_up_and_absurd_lengths_print_nothing(served, capfd):
 
 
 @pytest.mark.parametrize(
-    ("place", "told"),
+    ("place", "message"),
     [
         ("s3://bucket/corrections.yaml", "URLs are allowed only as output="),
         ("{0}/file/below.yaml", "cannot be written (Not a directory)"),
@@ -259,14 +259,14 @@ def test_a_reader_who_hangs_up_and_absurd_lengths_print_nothing(served, capfd):
         ("{0}/" + "x" * 250, "cannot be written (File name too long)"),
     ],
 )
-def test_a_file_that_cannot_be_written_is_refused_before_the_page_is_served(place, told, tmp_path, capfd):
+def test_a_file_that_cannot_be_written_is_refused_before_the_page_is_served(place, message, tmp_path, capfd):
     make_result(tmp_path)
     (tmp_path / "file").write_text("text")
     before = sorted(tmp_path.rglob("*"))
     assert run(["view", str(tmp_path / "result"), "--corrections", place.format(tmp_path)]) == 2
     printed = capfd.readouterr()
     assert printed.out == ""
-    assert told in printed.err
+    assert message in printed.err
     assert printed.err.count("\n") == 1
     assert sorted(tmp_path.rglob("*")) == before
 

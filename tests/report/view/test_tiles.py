@@ -28,14 +28,14 @@ RED = cv2.imencode(".png", np.full((256, 256, 3), (0, 0, 200), np.uint8))[1].tob
 @contextmanager
 def service(content=RED, status=200):
     """A service of tiles on this machine, and what it was asked for."""
-    asked = []
+    paths = []
 
     class Handler(BaseHTTPRequestHandler):
         def log_message(self, *_):
             pass
 
         def do_GET(self):
-            asked.append(self.path)
+            paths.append(self.path)
             self.send_response(status)
             self.end_headers()
             self.wfile.write(content)
@@ -44,7 +44,7 @@ def service(content=RED, status=200):
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     try:
-        yield f"http://127.0.0.1:{server.server_address[1]}", asked
+        yield f"http://127.0.0.1:{server.server_address[1]}", paths
     finally:
         server.shutdown()
         server.server_close()
@@ -67,16 +67,16 @@ def test_the_tile_of_a_place_is_that_of_all_slippy_maps():
     ],
 )  # fmt: skip
 def test_a_tile_is_fetched_by_names_of_xyz_and_wmts(template, path):
-    with service() as (address, asked):
+    with service() as (address, paths):
         tile = TileSource.of(f"{address}{template}", ORIGIN).fetch(2, 1, 3)
         assert (tile.content, tile.type) == (RED, "image/png")
-        assert asked[-1] == path
+        assert paths[-1] == path
         with pytest.raises(ConfigError, match="there is no tile 2/4/0"):
             TileSource(f"{address}{template}").fetch(2, 4, 0)
 
 
 @pytest.mark.parametrize(
-    ("address", "told"),
+    ("address", "message"),
     [
         ("ftp://host/{z}/{x}/{y}", "begins with https://"),
         ("file:///etc/{z}/{x}/{y}", "begins with https://"),
@@ -87,25 +87,29 @@ def test_a_tile_is_fetched_by_names_of_xyz_and_wmts(template, path):
     ],
 )
 def test_an_address_that_cannot_serve_is_refused_in_a_line_without_its_secrets(
-    address, told, tmp_path, capsys
+    address, message, tmp_path, capsys
 ):
     make_result(tmp_path)
     place = tmp_path / "result" / "map.geojson"
     write_geojson(replace(read_geojson(place), origin=ORIGIN), place)
     assert run(["view", str(tmp_path / "result"), "--background", address]) == 2
     printed = capsys.readouterr()
-    assert told in printed.err
+    assert message in printed.err
     assert printed.err.count("\n") == 1
     assert "hidden" not in printed.err
     assert printed.out == ""
 
 
 @pytest.mark.parametrize(
-    ("content", "status", "told"),
-    [(b"<html>no", 200, "no PNG, JPEG or WebP"), (RED, 403, "answers 403"), (RED * 9000, 200, "no PNG")],
+    ("content", "status", "message"),
+    [
+        (b"<html>no", 200, "not a PNG, JPEG or WebP"),
+        (RED, 403, "answers 403"),
+        (RED * 9000, 200, "not a PNG"),
+    ],
 )
-def test_what_is_no_tile_is_refused(content, status, told):
-    with service(content, status) as (address, _), pytest.raises(ConfigError, match=told):
+def test_what_is_no_tile_is_refused(content, status, message):
+    with service(content, status) as (address, _), pytest.raises(ConfigError, match=message):
         TileSource.of(f"{address}/{{z}}/{{x}}/{{y}}", ORIGIN)
 
 
@@ -125,7 +129,7 @@ def test_the_page_shows_the_tiles_and_asks_nobody_else(browser, tmp_path):
     folder = tmp_path / "result"
     place = folder / "map.geojson"
     write_geojson(replace(read_geojson(place), origin=ORIGIN), place)
-    with service() as (tiles, asked):
+    with service() as (tiles, paths):
         server, address, _ = server_of(folder, None, file_beside(folder), f"{tiles}/{{z}}/{{x}}/{{y}}")
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
@@ -139,4 +143,4 @@ def test_the_page_shows_the_tiles_and_asks_nobody_else(browser, tmp_path):
         server.shutdown()
         server.server_close()
         thread.join()
-    assert len(asked) > 1
+    assert len(paths) > 1

@@ -21,11 +21,11 @@ from v2hdm.adjust.layout import nearby_origin
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.sections.join import Labels, labels_of
+from v2hdm.adjust.sections.joined import JoinedCovariance
 from v2hdm.adjust.sections.parts import Part
 from v2hdm.adjust.sections.summary import (
     Border,
     Footing,
-    JoinedCovariance,
     Place,
     Summary,
     Values,

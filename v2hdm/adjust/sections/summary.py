@@ -2,8 +2,8 @@
 
 With the whitened variables y of :mod:`v2hdm.adjust.whitening`, in which the Hessian is the identity, the
 border is b = W'y for some columns W. By the part alone, b has the covariance W'W and the optimum -W'g. If all
-parts together move the border by d instead, y follows as y = -g + W (W'W)^-1 (d + W'g), and if they give it
-the covariance C, all else inherits C - W'W through the same regression (the law of total covariance).
+parts together move the border by d instead, y follows as y = -g + W (W'W)^-1 (d + W'g); what covariances
+follow is in :mod:`v2hdm.adjust.sections.joined`.
 """
 
 from __future__ import annotations
@@ -14,22 +14,18 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import one_hot
 
-from v2hdm.adjust.covariance import Covariance, reduced_root
+from v2hdm.adjust.covariance import reduced_root
 from v2hdm.adjust.descent import minimise
 from v2hdm.adjust.kernels.tables import move
 from v2hdm.adjust.model import Estimate
-from v2hdm.adjust.reduced import to_tiles
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.geometry.rigid import log
 from v2hdm.geometry.tensors import inverse
 from v2hdm.records import FloatArray
 
 _CORNERS_AT_ONCE = 256  # corners whose columns are computed together, to bound intermediate results
-_FRAMES_AT_ONCE = 64  # frames whose columns are computed together
 _MOST_STEPS = 12  # most steps of LBFGS with the border held, under one whitening: chosen
 
 
@@ -135,7 +131,7 @@ def corner_columns(whitening: Whitening, corners: Tensor) -> Columns:
     tip = whitening.reduced_factor.tip
     reduced = [tip.new_zeros(whitening.reduced_factor.size, 0)]
     of_corners = tip.new_zeros(2 * len(corners), 2 * len(corners))
-    for begin, end in _chunks(whitening, corners):
+    for begin, end in chunks_of(whitening, corners):
         chosen = corners[begin:end]
         factors = _factors(whitening, chosen)
         of_corners[2 * begin : 2 * end, 2 * begin : 2 * end] = factors.by_variable
@@ -161,7 +157,7 @@ def _factors(whitening: Whitening, corners: Tensor) -> _Factors:
     return _Factors(inverse, by_variable)
 
 
-def _chunks(whitening: Whitening, corners: Tensor) -> list[tuple[int, int]]:
+def chunks_of(whitening: Whitening, corners: Tensor) -> list[tuple[int, int]]:
     """Ranges of corners (m,) whose columns are computed together; joined ones are never separated."""
     is_joined = whitening.engine.arrays.joined[corners].tolist()
     begins = [0]
@@ -310,125 +306,3 @@ def _to_place(whitening: Whitening, place: Place, information: Tensor, slope: Te
         slope[rows] = turn.mT @ slope[rows]
         information[rows] = turn.mT @ information[rows]
         information[:, rows] = information[:, rows] @ turn
-
-
-@dataclass(frozen=True)
-class JoinedCovariance(Covariance):
-    """Covariances of a part that was joined with others; ``joint`` (n, n) is that of its ``border``."""
-
-    border: Border | None = None
-    joint: FloatArray | None = None
-
-    @cached_property
-    def _columns(self) -> Columns:
-        assert self.border is not None
-        return border_columns(self.whitening, self.border)
-
-    @cached_property
-    def _gained(self) -> Tensor:
-        """(W'W)^-1 (C - W'W) (W'W)^-1."""
-        alone = self._columns.covariance
-        difference = torch.as_tensor(self.joint, dtype=alone.dtype, device=alone.device) - alone
-        factor = torch.linalg.cholesky(alone)
-        return torch.cholesky_solve(torch.cholesky_solve(difference, factor).mT, factor)
-
-    def slopes(self, reduced: Tensor, corners: Tensor) -> FloatArray:
-        """Slopes (b, n) of the cost by the border's step under n errors, all else following both.
-
-        The errors are columns by the whitened unknowns: ``reduced`` (D, n) and of ``corners`` (N, 2, n).
-        """
-        return np.asarray(self._in_border(self._pulled(reduced, corners)).cpu().numpy())
-
-    def followed(self, reduced: Tensor, corners: Tensor, steps: FloatArray) -> tuple[Tensor, Tensor]:
-        """Whitened steps under n errors, as in :meth:`slopes`, where the border makes ``steps`` (b, n)."""
-        assert self.border is not None
-        pulled = self._pulled(reduced, corners)
-        last, of_border = self._columns.pushed(self._in_border(torch.as_tensor(steps).to(pulled) + pulled))
-        moved = -reduced
-        moved[len(moved) - len(last) :] += last
-        moved_corners = -corners
-        if len(of_border):
-            moved_corners[self.border.corners] += of_border
-        return moved, moved_corners
-
-    def _pulled(self, reduced: Tensor, corners: Tensor) -> Tensor:
-        """Inner products (b, n) of the border's columns and others."""
-        assert self.border is not None
-        return self._columns.pulled(reduced, corners[self.border.corners])
-
-    def _in_border(self, columns: Tensor) -> Tensor:
-        """(W'W)^-1 times columns (b, n)."""
-        return torch.cholesky_solve(columns, torch.linalg.cholesky(self._columns.covariance))
-
-    def _cameras(self) -> list[FloatArray]:
-        """Covariances (6 + Q, 6 + Q) of each camera's unknowns."""
-        assert self.joint is not None
-        count = self.whitening.engine.arrays.camera_unknowns
-        tip = len(self.whitening.reduced_factor.tip)
-        return [self.joint[k : k + count, k : k + count] for k in range(0, tip, count)]
-
-    def camera_information(self) -> FloatArray:
-        """Marginal information (C (6 + Q), C (6 + Q)) of the cameras' left tangents and clock offsets."""
-        assert self.joint is not None
-        tip = len(self.whitening.reduced_factor.tip)
-        return np.asarray(np.linalg.inv(self.joint[:tip, :tip]), dtype=np.float64)
-
-    def poses(self) -> FloatArray:
-        """Variances (J, 6) of the frames' tangents; 0 without states."""
-        assert self.border is not None
-        whitening = self.whitening
-        if len(self.border.corners) == len(whitening.plan.kept_corners):
-            return self._poses(self._tail())
-        out = self._poses(None)
-        arrays = whitening.engine.arrays
-        axes = torch.tensor(arrays.states, dtype=torch.int64, device=arrays.centre.device)
-        acts = one_hot(axes, 6).to(torch.float64)
-        for begin in range(0, arrays.frame_count if arrays.states else 0, _FRAMES_AT_ONCE):
-            frames = torch.arange(begin, min(begin + _FRAMES_AT_ONCE, arrays.frame_count), device=axes.device)
-            of_frames = _frame_columns(whitening, frames, acts)
-            regression = self._columns.reduced.mT @ of_frames[len(of_frames) - len(self._columns.reduced) :]
-            gained = ((self._gained @ regression) * regression).sum(0).view(-1, 6)
-            out[begin : begin + len(gained)] += gained.cpu().numpy()
-        return out
-
-    def _tail(self) -> Tensor:
-        """The joint covariance at the tiles of the border and the tip."""
-        tail = self.whitening.reduced_factor.tail(self.whitening.plan.border_tiles)
-        root = tail.solve(torch.eye(tail.size, dtype=tail.tip.dtype, device=tail.tip.device))
-        by_border = root.mT @ self._columns.reduced[-tail.size :]
-        return root.mT @ root + by_border @ self._gained @ by_border.mT
-
-    def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
-        assert self.border is not None
-        arrays = self.whitening.engine.arrays
-        rank = torch.argsort(arrays.corner_order)
-        chosen = rank[torch.as_tensor(groups, device=rank.device)]
-        unit = (~arrays.joined).cumsum(0)
-        corners = torch.isin(unit, unit[chosen.flatten()]).nonzero()[:, 0]
-        columns = corner_columns(self.whitening, corners)
-        # Corners of the border have their own variables in common with it.
-        on_border = columns.own.new_zeros(2 * len(self.border.corners), columns.own.shape[1])
-        is_shared = torch.isin(corners, self.border.corners)
-        places = torch.searchsorted(self.border.corners, corners[is_shared])
-        on_border[_axes(places)] = columns.own[_axes(is_shared.nonzero()[:, 0])]
-        regression = self._columns.pulled(
-            columns.reduced, on_border.view(len(self.border.corners), 2, on_border.shape[1])
-        )
-        place = _axes(torch.searchsorted(corners, chosen.contiguous()))
-        covariance = columns.covariance + regression.mT @ self._gained @ regression
-        return np.asarray(covariance[place[:, :, None], place[:, None, :]].cpu().numpy())
-
-
-def _frame_columns(whitening: Whitening, frames: Tensor, acts: Tensor) -> Tensor:
-    """Reduced columns (D, b n) of ``acts`` (S, n) on the states of frames (b,)."""
-    arrays = whitening.engine.arrays
-    selected = acts.new_zeros(arrays.frame_count, len(acts), len(frames), acts.shape[1])
-    selected[frames, :, torch.arange(len(frames), device=frames.device)] = acts
-    tiles = to_tiles(whitening.plan, selected.flatten(2))
-    tip = tiles.new_zeros(len(whitening.reduced_factor.tip), tiles.shape[1])
-    return whitening.reduced_factor.solve(torch.cat([tiles, tip]))
-
-
-def _axes(index: Tensor) -> Tensor:
-    """Rows (..., 2 n) of x and y of points (..., n)."""
-    return torch.stack([2 * index, 2 * index + 1], dim=-1).flatten(-2)

@@ -19,7 +19,7 @@ def _run(arguments: Sequence[str]) -> None:
     """List or prune a cache."""
     parser = COMMAND.parser()
     actions = parser.add_subparsers(dest="what", metavar="{list,prune}", required=True)
-    listing = actions.add_parser("list", help="list entries, their size and last use")
+    listing = actions.add_parser("list", help="list entries with size and last use")
     pruning = actions.add_parser("prune", help="remove least recently used entries, and leftovers")
     pruning.add_argument("--gb", type=float, required=True, help="size to keep, GB; 0 empties the cache")
     for action in (listing, pruning):

@@ -78,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _is_drafted(parsed: argparse.Namespace) -> bool:
-    """Whether drive.yaml is written; if not, what it needs is asked for."""
+    """Write drive.yaml, or print the missing settings; returns whether it was written."""
     from v2hdm.io.drive.draft import draft_drive
 
     log_to_terminal()

@@ -54,7 +54,7 @@ def _run(arguments: Sequence[str]) -> int:
     for option, value in (("--tolerance", parsed.tolerance), ("--size-tolerance", size_m)):
         if not TOLERANCE_M.holds(value):
             limits = f"from {TOLERANCE_M.least:g} to {TOLERANCE_M.most:g}"
-            raise ConfigError(f"{option} {value:g}: is no tolerance in m; give one {limits}")
+            raise ConfigError(f"{option} {value:g}: is not a tolerance in m; give one {limits}")
     source = Source(parsed.crs, parsed.unit, kinds_of(parsed.kinds))
     path = map_file(parsed.map)
     hd_map = read_map(path)[0]
@@ -72,7 +72,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 class _Compared(NamedTuple):
-    """The findings, the misfit of the whole design, and whether all of it conforms."""
+    """The findings, the misfit of the whole design, and whether everything conforms."""
 
     findings: Sequence[Finding]
     misfit: Misfit | None  # None against rules

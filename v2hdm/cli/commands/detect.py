@@ -56,13 +56,17 @@ def _run(arguments: Sequence[str]) -> None:
     parser.add_argument("--mounting", type=float, nargs=3, metavar=values, help=rough)
     parser.add_argument("--linear", action="store_true", help="grey values proportional to light, not sRGB")
     parser.add_argument("--model", metavar="FILE", help="the network, ONNX (default: the shipped one)")
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="for the network (default: 1)")
+    parser.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="threads of the network (default: 1)"
+    )
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
     newest = "process the newest image of a camera or growing folder, and drop older ones"
     parser.add_argument("--live", action="store_true", help=newest)
     where = "with --live: read where to look next from standard input, JSON lines (docs/detect.md)"
     parser.add_argument("--regions", action="store_true", help=where)
-    parser.add_argument("--output", type=Path, metavar="FILE", help="for the JSON lines (default: stdout)")
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="file for the JSON lines (default: stdout)"
+    )
     parser.add_argument("--draw", type=Path, metavar="DIR", help="folder for images with detections drawn")
     _detect(parser.parse_args(arguments))
 
@@ -142,7 +146,7 @@ def _write(
 
 
 def _warn_of_unknown(model: Path) -> None:
-    """Say on stderr that the judge was not fitted to a network, if it was not."""
+    """Warn on stderr if the judge was not fitted to the network."""
     from v2hdm.detection.weights import unknown_network
 
     unknown = unknown_network(model)
@@ -151,7 +155,7 @@ def _warn_of_unknown(model: Path) -> None:
 
 
 def _regions_from(stream: IO[str]) -> Callable[[Frame], Pointed | None]:
-    """Where to look in a frame, by the latest line of a stream if that is of the frame's time."""
+    """The regions of a frame, from the latest line of a stream if that line has the frame's time."""
     from v2hdm.detection.pointing import Pointer
 
     pointer = Pointer()
@@ -160,7 +164,7 @@ def _regions_from(stream: IO[str]) -> Callable[[Frame], Pointed | None]:
 
 
 def _new_name(name: str, in_use: set[str]) -> str:
-    """A name that is not in use yet, and then is: images of several folders or endings may share theirs."""
+    """A new unique name, now taken: images of several folders or formats may share one."""
     while name.casefold() in in_use:
         name += "_"
     in_use.add(name.casefold())
@@ -200,7 +204,7 @@ def _report(stopwatch: Stopwatch, age_s: Sequence[float]) -> None:
 
 
 def _peak_memory() -> str:
-    """The most memory that this process ever held, where Linux counts it."""
+    """This process's peak memory, where Linux reports it."""
     status = Path("/proc/self/status")  # getrusage would count what the parent held when it started us
     lines = status.read_text().splitlines() if status.is_file() else []
     peak_kb = next((int(line.split()[1]) for line in lines if line.startswith("VmHWM")), None)

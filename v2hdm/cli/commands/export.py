@@ -81,7 +81,7 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
     chosen = formats.with_data(parsed.format)
     hd_map, verdict = read_map(parsed.source)
     grid = formats.check_crs(parsed.crs, chosen, hd_map.origin, "--crs").get("gpkg")
-    # A project takes the GeoPackage that is there, whoever wrote it, where it is of this map.
+    # A project uses an existing GeoPackage of this map, whatever wrote it.
     geopackage = folder / formats.FORMATS["gpkg"].file.format(name=name)
     crs = None if grid is None else grid.crs
     is_kept = "gpkg" not in parsed.format and formats.holds(geopackage, hd_map, crs)
@@ -120,7 +120,7 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
 
 
 def _check_used(value: object, option: str, users: Sequence[str], chosen: Sequence[str]) -> None:
-    """Refuse an option of which none of the formats ``chosen`` makes use."""
+    """Refuse an option that none of the ``chosen`` formats uses."""
     if value and not set(users) & set(chosen):
         raise ConfigError(
             f"{option}: only the formats {', '.join(users[:-1])} and {users[-1]} have a use for it"

@@ -28,7 +28,7 @@ def _run(arguments: Sequence[str]) -> int:
     parser = COMMAND.parser()
     parser.add_argument("map", type=Path, help=_MAP)
     add_drive(parser, "localized")
-    parser.add_argument("--live", action="store_true", help="of a vehicle as it drives: see --live --help")
+    parser.add_argument("--live", action="store_true", help="while the vehicle drives: see --live --help")
     parsed = parser.parse_args(arguments)
     need_installed("torch")  # before the drive is read, and long before it is loaded
     from v2hdm.io.calibration.reading import trusted_calibrations
@@ -57,14 +57,16 @@ def _live_parser() -> argparse.ArgumentParser:
     """The options of a vehicle as it drives."""
     parser = COMMAND.parser()
     parser.add_argument("map", type=Path, help=_MAP)
-    parser.add_argument("--live", action="store_true", required=True, help="of a vehicle as it drives")
-    image = "a camera's name, and a folder that its images are written to, or its index; repeatable"
+    parser.add_argument(
+        "--live", action="store_true", required=True, help="localise while the vehicle drives"
+    )
+    image = "a camera's name and its device index, or the folder that receives its images; repeatable"
     parser.add_argument("--images", action="append", required=True, metavar="CAMERA=SOURCE", help=image)
-    motion = "speeds and yaw rates, and positions if there are any: a file that grows, or - for stdin"
+    motion = "speeds, yaw rates and any positions: a file that grows, or - for stdin"
     parser.add_argument("--motion", required=True, metavar="FILE", help=motion)
-    begin = "where it starts, to 5 m and 20 deg: m and deg from east to north (default: anywhere)"
+    begin = "start, within 5 m and 20 deg; the heading counts from east to north (default: anywhere)"
     parser.add_argument("--start", type=float, nargs=3, metavar=("EAST", "NORTH", "HEADING"), help=begin)
-    antenna = "where the antenna of the positions is: m ahead of the rear axle and to the left (default: 0 0)"
+    antenna = "place of the positions' antenna: m ahead of the rear axle and to the left (default: 0 0)"
     parser.add_argument(
         "--antenna", type=float, nargs=2, default=(0.0, 0.0), metavar=("AHEAD", "LEFT"), help=antenna
     )
@@ -73,14 +75,14 @@ def _live_parser() -> argparse.ArgumentParser:
         "--calibration", action="append", type=Path, default=[], metavar="FILE", help=calibration
     )
     parser.add_argument(
-        "--delay", type=float, default=0.0, metavar="S", help="from a picture to its file's date"
+        "--delay", type=float, default=0.0, metavar="S", help="age of a picture when its file is dated, s"
     )
-    full = (
-        "of N images of a camera, search at least one as a whole, the others where the map expects markings"
-    )
+    full = "search one of N images of a camera as a whole, the others where the map expects markings"
     parser.add_argument("--every-full", type=int, default=5, metavar="N", help=f"{full} (default: 5)")
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
-    parser.add_argument("--output", type=Path, metavar="FILE", help="for the JSON lines (default: stdout)")
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="file for the JSON lines (default: stdout)"
+    )
     mcap = "a new folder for an MCAP of ROS 2 messages (extra ros)"
     parser.add_argument("--mcap", type=Path, metavar="DIR", help=mcap)
     return parser

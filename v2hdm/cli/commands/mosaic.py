@@ -14,7 +14,9 @@ def _run(arguments: Sequence[str]) -> None:
     """Add the mosaic to a result: the ground as a GeoTIFF, and pictures before and after."""
     parser = COMMAND.parser()
     add_result(parser)
-    parser.add_argument("--resolution", type=float, metavar="M", default=0.02, help="a pixel (default: 0.02)")
+    parser.add_argument(
+        "--resolution", type=float, metavar="M", default=0.02, help="size of a pixel (default: 0.02)"
+    )
     parser.add_argument("--device", default="cpu", metavar="NAME", help="cpu or cuda (default: cpu)")
     parsed = parser.parse_args(arguments)
     import torch  # noqa: F401  # its absence is reported before that of what is built on it

@@ -72,7 +72,7 @@ def _run(arguments: Sequence[str]) -> None:
 def _write(
     folder: Path, drive: Drive | None, parsed: argparse.Namespace, job: object, comparison: Path | None
 ) -> list[Path]:
-    """Write page and paper with what is stated now; where they cannot be, what was stated before stays."""
+    """Write page and paper with the new statements; if that fails, the old statements stay."""
     from v2hdm.report.coverage import coverage_of, write_coverage
     from v2hdm.report.job import Job, read_job
     from v2hdm.report.page.document import write_page  # the libraries of its charts, which takes seconds
@@ -101,7 +101,7 @@ def _write(
 
 
 def _restate(folder: Path, job: StatedJob) -> None:
-    """Replace what is stated of the survey, although the report has that file as an input."""
+    """Replace the statements on the survey, although their file is an input of the report."""
     from v2hdm.report.job import write_job
 
     with protected_inputs():
@@ -109,7 +109,7 @@ def _restate(folder: Path, job: StatedJob) -> None:
 
 
 def _beside(result: Path) -> Path | None:
-    """The comparison that ``v2hdm compare`` has made of a result, where it lies by default; None if none."""
+    """The comparison of a result in the default folder of ``v2hdm compare``; None if there is none."""
     from v2hdm.store.files import load_json
 
     folder = result.resolve().with_name(f"{result.resolve().name}-compared")

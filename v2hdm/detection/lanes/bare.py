@@ -28,7 +28,7 @@ _ACROSS_M = np.linspace(-_REACH_M, _REACH_M, 37)  # places (X,) along a profile,
 _STEP_M = 2 * _REACH_M / (len(_ACROSS_M) - 1)  # their distance, m
 
 _WIDTHS_M = np.array([0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4])  # of lines that are fitted, m
-_SHIFTS_M = np.arange(-0.15, 0.151, 0.025)  # by which a line may lie beside what was traced, m
+_SHIFTS_M = np.arange(-0.15, 0.151, 0.025)  # offsets to the side of the traced line to try, m
 _BLURS_M = np.array([0.0, 0.01, 0.02, 0.03, 0.05])  # of images, m on the ground: those of templates
 _BLUR_PX = 0.6  # of images, px
 _USUAL_WIDTH_M = 0.12  # width of lines, m: standards have 0.1 to 0.15 m beside 0.2 to 0.3 m
@@ -71,7 +71,7 @@ class Sections(NamedTuple):
 
     profile: FloatArray  # (S, X) log light
     px_m: FloatArray  # (S,) ground a px wide, m
-    piece: IntArray  # (S,) the piece that each is of
+    piece: IntArray  # (S,) the piece of each
     end_m: FloatArray  # (S,) where it ends at the latest, m along the piece
 
 

@@ -16,7 +16,7 @@ _SLOPE_POINTS = 6  # last points of a chain that give its direction
 _MAX_SLOPE = 4.5  # most columns per row from a chain's first crossing to its second
 _GATE_PX = 12.0  # largest distance of a crossing from a chain's continuation, px, one row anchor farther
 _YOUNG = 1.5  # factor on that distance for a chain of fewer points than give its direction
-_WIDENING = 0.04  # share by which that distance grows with each further row
+_WIDENING = 0.04  # growth of that distance per row
 _ROW_STEP_PX = 8  # rows between neighbouring row anchors in full resolution
 
 _RULES = {

@@ -23,7 +23,7 @@ from v2hdm.detection.camera import Horizon, RoadCamera
 from v2hdm.detection.network import AnchorRow, NetworkOutput
 from v2hdm.records import BoolArray, FloatArray, IntArray, LaneDetection
 
-NEIGHBOURS = 3.0  # correlated points of a line that are worth an independent one
+NEIGHBOURS = 3.0  # correlated points of a line that count as one independent point
 _MODEL_SIGMA_M = 0.02  # sigma of painted lines about the curve
 
 

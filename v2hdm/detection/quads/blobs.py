@@ -18,13 +18,13 @@ from v2hdm.detection.network import NetworkOutput, as_probability
 from v2hdm.native import kernels
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_MIN_CELLS = 5  # blobs of fewer cells are noise: their outline is not worth four corners
+_MIN_CELLS = 5  # blobs of fewer cells are noise: their outline does not determine four corners
 _LEAST_SHARE = 0.15  # share of a blob from which a group of classes is present: two groups are two markings
 _LEAST_SYMBOL_SHARE = 0.25  # that share for a group of symbols: the head is more of an arrow
 
 _SURE = 2.0  # log odds at which paint is sure: markings that nearly touch come apart in sure paint
 _DOUBTFUL = -2.0  # least log odds of doubtful paint, which joins parts of a marking that a shadow divides
-_LEAST_SURE = 0.2  # share of a piece of doubtful paint that is likely from which the piece is of use
+_LEAST_SURE = 0.2  # least likely share of a doubtful piece of paint that is used
 _MOST_SURE = 0.6  # share of it that is likely up to which the piece is news
 _MOST_PARTS = 12  # parts that are looked at of one piece: more are the grains of bad light
 
@@ -221,7 +221,7 @@ class _Scores(NamedTuple):
 def _class_scores(
     output: NetworkOutput, piece: np.ndarray, level: np.ndarray, count: int, groups: _Groups
 ) -> _Scores:
-    """The scores of ``count`` pieces, of which ``piece`` (h, w) is the map."""
+    """The scores of ``count`` pieces; ``piece`` (h, w) maps elements to pieces."""
     tally = _tally(output, piece, level, count, (-1, -1))
     number = np.maximum(tally.cells, 1)
     score = (tally.certainty / number) * (tally.probability / number[:, None]).T
@@ -235,7 +235,7 @@ class _Tally(NamedTuple):
     """The network's probabilities over the elements of ``count`` pieces, added up."""
 
     cells: IntArray  # (count,) elements
-    best: IntArray  # (count, K) of which each class is the likeliest
+    best: IntArray  # (count, K) elements where each class is the likeliest
     certainty: FloatArray  # (count,) sum of the probabilities of paint
     probability: FloatArray  # (count, K) sums of those of the classes, were it paint
 

@@ -36,7 +36,7 @@ _SEARCH_SIGMA = 0.1  # how far the network's outline is from a side's end before
 _SEARCH_STEPS = 4  # steps of a search at most; with fewer KITTI 0011 or port 2 has one false marking
 _STEPS = 8  # steps of a fit at most
 
-_BLOOM = 1.2  # blurs by which the outline of clipped paint lies outside of the paint
+_BLOOM = 1.2  # offset, in blurs, of clipped paint's outline outside the paint
 _MUCH_CLIPPED = 0.15  # share of a marking's pixels that are clipped from which that is so
 
 _MOST_MOVED = 0.5  # a fit that moves its middle by more of its size follows something else

@@ -29,13 +29,13 @@ _MOST_PIXELS = 600  # a band of more pixels is thinned: all markings of an image
 
 _MAX_BETWEEN = 160  # pixels to which the choice of places aims between the ends of a slim quadrilateral
 _MAX_AT_ENDS = 260  # pixels to which it aims at the two ends of a slim quadrilateral
-_END_PX = 2.0  # distance, px, by which the ends of a slim quadrilateral reach past its corners
+_END_PX = 2.0  # distance, px, that the ends of a slim quadrilateral reach past its corners
 _MOST_ENDS = 1 / 3  # share of the length that the two ends of a slim quadrilateral take at most
 
 _SEARCH_ALONG = 40  # points of the coarse grid, on which a fit begins, along a marking
 _SEARCH_ACROSS = 12  # points of the coarse grid across a marking
-_MARGIN_ALONG = 0.2  # lengths by which the coarse grid reaches beyond the ends of a quadrilateral
-_MARGIN_ACROSS = 0.4  # widths by which the coarse grid reaches beyond its long sides
+_MARGIN_ALONG = 0.2  # reach of the coarse grid beyond the ends of a quadrilateral, in lengths
+_MARGIN_ACROSS = 0.4  # reach of the coarse grid beyond its long sides, in widths
 
 _GREY_FIRST = 1.2  # how many times clearer red or blue must be for grey to be left: it has the least noise
 
@@ -224,7 +224,7 @@ class _Band(NamedTuple):
     near_right: BoolArray  # (M, W) whether the next place is as near as any
     near_below: BoolArray  # (M, H)
     outward: np.ndarray  # (M, 4, 3) float32 to distances outside the sides, in the box
-    spare_px: np.ndarray  # (M,) float32 by which the sides are bowed
+    spare_px: np.ndarray  # (M,) float32, bow of the sides
     outside_px: float = _OUTSIDE_PX
     inside_px: float = _INSIDE_PX
     most: int = _MOST_PIXELS

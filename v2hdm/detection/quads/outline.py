@@ -10,9 +10,7 @@ from v2hdm.geometry.planar import signed_area
 from v2hdm.records import BoolArray, FloatArray
 
 _FINER = 4  # how many times as fine as the network's output an outline is drawn
-_EDGE_SIGMA_PX = (
-    2.0  # weight of an edge falls by a Gaussian of this sigma with its distance from the outline, px
-)
+_EDGE_SIGMA_PX = 2.0  # sigma, px, of the Gaussian weight of an edge at a distance from the outline
 _REACH_PX = 6.0  # distance to either side of an outline, px, to which an edge is looked for
 _STEP_PX = 0.5  # distance between the places, px, at which an edge is looked for
 _EDGE_PX = 2.0  # half the width of an edge in the image, px: its blur

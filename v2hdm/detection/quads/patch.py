@@ -63,7 +63,7 @@ class Source(NamedTuple):
     """The image that pixels are looked up in."""
 
     image: np.ndarray  # (H, W, 3) uint8 BGR
-    owner: np.ndarray  # (h, w) int16: 1 + the index of the piece of paint that an element is of, 0 for none
+    owner: np.ndarray  # (h, w) int16: 1 + the index of the piece of paint of an element, 0 for none
     top: int  # the image row of the first element
     stride: int  # px per element
     radiance: np.ndarray  # (256,) float32 of each code

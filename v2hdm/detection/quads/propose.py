@@ -146,7 +146,7 @@ class Proposals:
     camera: RoadCamera
     output: NetworkOutput
     pieces: Sequence[Proposal]
-    owner: np.ndarray  # (h, w) 1 + the index of the piece that each element of the paint is of, 0 for none
+    owner: np.ndarray  # (h, w) 1 + the index of the piece of each element of the paint, 0 for none
 
 
 def propose(

@@ -47,7 +47,7 @@ _MAX_STEP = 2.0  # longest step of a side, in blurs
 _MAX_CONTRAST_STEP = 0.5  # longest step of the log contrast
 _SETTLED_PX = 0.05  # a step of a fit that is shorter than this is the last, px
 _FOUND_PX = 0.3  # a step of a search that is shorter than this is the last, px
-_INSIGNIFICANT = 0.01  # a step by which chi-square was to fall by no more than this is the last
+_INSIGNIFICANT = 0.01  # stop after a step whose predicted fall of chi-square is no more than this
 _HELD = 1e9  # information of a blur that is held
 
 _SIDES = np.arange(8)  # places of the sides' starts, 0 to 3, and ends, 4 to 7, among the unknowns

@@ -165,7 +165,7 @@ def _of_xml(path: Path, text: str) -> dict[str, Any]:
 
 
 def _scalar(text: str | None) -> object:
-    """A number where it is one, else the text without the quotes that OpenCV puts around it."""
+    """A number if the text is one, else the text without OpenCV's quotes."""
     words = (text or "").strip()
     try:
         return float(words)

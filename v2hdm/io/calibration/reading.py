@@ -316,9 +316,9 @@ def read_rectification(path: Path) -> FloatArray:
 def take_rotation(content: object, where: str, error: type[V2hdmError]) -> FloatArray:
     """``content`` as a rotation (3, 3); ``error`` where it is none."""
     rotation = take_array(content, (3, 3), where, error)
-    limited = np.clip(rotation, -2.0, 2.0)  # larger numbers are of no rotation, nor are their squares numbers
+    limited = np.clip(rotation, -2.0, 2.0)  # larger numbers belong to no rotation, and their squares overflow
     if not (np.abs(limited @ limited.T - np.eye(3)).max() < _ROTATION_TOLERANCE < np.linalg.det(limited)):
-        raise error(f"{where}: is no rotation (rows of length 1, at right angles); fix it")
+        raise error(f"{where}: is not a rotation (rows of length 1, at right angles); fix it")
     return np.asarray(rotation)
 
 

@@ -37,7 +37,7 @@ def write_calibration(
 ) -> None:
     """Write our own calibration file, atomically.
 
-    The sigmas are of the left-perturbation tangent of ``cam_from_vehicle``, along the camera's own axes
+    The sigmas refer to the left-perturbation tangent of ``cam_from_vehicle``, along the camera's own axes
     (right, down, forward), and left out without a covariance. ``clock_s`` is the delay of its images behind
     their stamps and its sigma (infinite where unknown), ``read_out_s`` the estimated time from first row to
     last and its sigma, ``verdict`` that on the run which found it, as JSON.

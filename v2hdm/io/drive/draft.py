@@ -149,7 +149,7 @@ def _refuse_unused(content: Mapping[str, Any], settings: Sequence[str]) -> None:
     unused = [".".join(keys) for keys in of_cameras if keys[1] not in with_images]
     if unused:
         raise DriveError(
-            f"--set {', '.join(unused)}: not used, for there is no camera of that name; name "
+            f"--set {', '.join(unused)}: not used: no camera has that name; name "
             f"{' or '.join(content.get('cameras', {})) or 'its images, too'}"
         )
 

@@ -208,8 +208,8 @@ def _read_mask(entry: dict[str, Any], root: Path, info: CameraInfo, where: str) 
     mask = read_pixels(path, cv2.IMREAD_GRAYSCALE)
     if mask.shape != (info.height, info.width):
         raise DriveError(
-            f"{where}, mask: {path} is no image of {info.width} x {info.height} px; draw the vehicle white "
-            "on black over one of the camera's images"
+            f"{where}, mask: {path} is not an image of {info.width} x {info.height} px; draw the vehicle "
+            "white on black over one of the camera's images"
         )
     return np.asarray(mask > 0)
 

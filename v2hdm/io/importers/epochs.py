@@ -16,7 +16,7 @@ import numpy as np
 from v2hdm.records import FloatArray
 
 _MOST = 0.5  # share of the sentences that decides
-_LATE_S = 0.5  # share of an epoch by which arrivals tell one from the next
+_LATE_S = 0.5  # share of an epoch that separates arrivals of one from those of the next
 
 
 class Untimed(NamedTuple):

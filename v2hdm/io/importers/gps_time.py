@@ -23,7 +23,7 @@ _LEAPS_S = np.array([datetime.fromisoformat(f"{day}T00:00:00+00:00").timestamp()
 
 
 def leap_seconds(unix_s: float) -> int:
-    """Seconds by which GPS time is ahead of UTC at a time of 1970 (18 since 2017)."""
+    """Seconds that GPS time is ahead of UTC at a Unix time (18 since 2017)."""
     return int(np.searchsorted(_LEAPS_S, unix_s, side="right"))
 
 

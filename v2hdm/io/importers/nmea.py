@@ -459,7 +459,7 @@ class _Log:
         return _Receiver(self._alone(first, kind), set())
 
     def _alone(self, source: _Source, kind: str) -> _Source:
-        """The source, if its positions are of one receiver."""
+        """The source, if its positions come from one receiver."""
         if len(source.apart_m) > _SWITCHES * len(source.fixes):
             raise DriveError(
                 f"{self._where}: two {kind} positions at one time, {np.median(source.apart_m):.2g} m apart: "
@@ -573,7 +573,7 @@ def _apart(fix: _Fix, other: _Fix) -> float:
 
 
 def _apart_at_once(source: _Source, other: _Source) -> float | None:
-    """The distance of two receivers, m; None where both sources are of one receiver."""
+    """The distance of two receivers, m; None if both sources are the same receiver."""
     shared_stamps = sorted(set(source.fixes) & set(other.fixes))
     if shared_stamps:
         pairs = np.array([(*source.fixes[stamp][:2], *other.fixes[stamp][:2]) for stamp in shared_stamps])

@@ -45,7 +45,7 @@ from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping,
 
 _log = logging.getLogger(__name__)
 
-COURSE = "course"  # a heading that nothing recorded: the smoothed course over ground is one
+COURSE = "course"  # a heading that was not recorded: the smoothed course over ground replaces it
 HEADINGS = ("true", "grid", COURSE)
 _USUAL_SIGMA_M = 0.02  # of a position that states none: RTK, fixed, as in records.PoseNoise
 _SAME_HEADING_DEG = 0.2  # headings closer than this are one: the noise of two antennas a metre apart
@@ -60,7 +60,7 @@ class PoseSettings:
     vehicle_from_sensor: FloatArray  # (3, 3), turn of the attitude's sensor on the vehicle
     crs: str | None = None  # of the coordinates, such as EPSG:25832; None for the map's own, or WGS84
     heading: str | None = None  # north that headings count from, one of HEADINGS
-    lever_arm_m: FloatArray | None = None  # (3,), the point that positions are of, in the vehicle frame
+    lever_arm_m: FloatArray | None = None  # (3,), the point that positions refer to, in the vehicle frame
     max_sigma_m: float = 0.1  # less sure positions are left out: RTK fixed is 0.02, float about 0.5
     geoid_m: float | None = None  # height of the geoid above the ellipsoid, for heights above the sea
     epoch: float | None = None  # of the coordinates, in years
@@ -103,7 +103,7 @@ POSE_FORMATS: Mapping[str, tuple[_Reader, tuple[str, ...]]] = {
     "pos": (read_pos, ()),
     "ubx": (read_ubx, keys_in(UbxPoses, PoseKeys).optional),
 }
-"""Formats of files by the key that names the file: the reader, and keys of its own. ``topic`` is of a bag."""
+"""Formats of files by the key that names the file: the reader, and keys of its own; bags have ``topic``."""
 
 
 def read_poses(
@@ -329,12 +329,12 @@ def _without(readings: Readings, is_usable: BoolArray) -> Readings:
 def _finite(values: FloatArray, sigma_m: FloatArray, where: str, things: str) -> BoolArray:
     """Flags (N,) of the rows of ``values`` (N, V) that are numbers; the others are counted."""
     is_number = np.asarray(np.isfinite(values).all(axis=1))
-    lost = ~is_number & ~np.isinf(sigma_m)  # a position without a fix is told of as such
+    lost = ~is_number & ~np.isinf(sigma_m)  # a position without a fix is counted as such
     if not is_number.any():
         raise DriveError(f"{where}: none of its {len(is_number)} {things} is a number; record it again")
     if lost.any():
         _log.warning(
-            "%s: left out %d of %d %s that are no numbers", where, int(lost.sum()), len(lost), things
+            "%s: left out %d of %d %s that are not numbers", where, int(lost.sum()), len(lost), things
         )
     return is_number
 

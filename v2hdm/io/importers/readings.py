@@ -87,7 +87,7 @@ class Readings:
     geodetic: bool
     sigma_m: FloatArray  # (P,) of a horizontal coordinate, nan where not stated, infinite without a fix
     attitudes: Attitudes | None
-    point: str = ""  # what the positions are of, which seldom sits at the vehicle's origin: an antenna's
+    point: str = ""  # the point that positions refer to, seldom the vehicle's origin: an antenna's
     is_fixed: BoolArray | None = None  # (P,) whether RTK had fixed its ambiguities, None where not stated
     turning: Turning | None = None  # of a gyro's file beside the receiver
     rates: TurnRates | None = None  # of a gyro in the bag

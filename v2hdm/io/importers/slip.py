@@ -49,7 +49,7 @@ def driven(first: Trajectory, second: Trajectory) -> Choice:
 
 
 def _cost(chords: _Chords, variance: float, lever_m: float) -> float:
-    """Squares by which chords miss the heading, but for a constant and the lever arm's error, in sigmas."""
+    """Squared misfit of chords to the heading, in sigmas, after a constant and the lever arm's error."""
     weight = 1 / np.sqrt(variance * (chords.overlap if np.isfinite(lever_m) else 1.0))
     columns = weight * np.column_stack([np.ones(len(chords.off_rad)), chords.curvature])
     columns = np.vstack([columns, [[0.0, 1 / lever_m]]])

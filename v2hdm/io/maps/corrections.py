@@ -224,7 +224,7 @@ def _check_added(entry: Mapping[str, Any], outline: FloatArray, where: str) -> N
 
 
 def is_quadrilateral(outline: FloatArray) -> bool:
-    """Whether an outline (N, 2) is of four corners, counter-clockwise, whose sides do not cross."""
+    """Whether an outline (N, 2) has four counter-clockwise corners and no crossing sides."""
     return len(outline) == 4 and is_simple(outline) and float(signed_area(outline)) > 0
 
 

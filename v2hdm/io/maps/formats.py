@@ -179,7 +179,7 @@ def with_data(formats: Sequence[str]) -> list[str]:
 def check_crs(
     crs: str | None, formats: Sequence[str], origin: GeodeticOrigin | None, key: str
 ) -> Mapping[str, Grid]:
-    """The grid of each format that takes the ``crs``; raises ConfigError where it cannot hold the site."""
+    """The grid of each format that supports ``crs``; raises ConfigError if it does not cover the site."""
     chosen = [name for name in formats if crs is not None and _ALL[name].takes_crs]
     if crs is not None and not chosen:
         others = ", ".join(
@@ -246,7 +246,7 @@ def write_map(
 def _tell_open(
     graph: LaneGraph, origin: GeodeticOrigin | None, folder: Path, name: str, has_drives: bool
 ) -> list[Path]:
-    """Write what lanes leave open where drives are known; log what else a user must know of them."""
+    """Write the open questions on lanes if drives are known; log other notes on lanes."""
     for question in graph.questions:
         if question.subject == "line":
             _log.warning("%s: %s; it bounds no lane: redraw it", name, question.text)

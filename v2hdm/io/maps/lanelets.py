@@ -100,7 +100,7 @@ class Lanelets:
     def _right_of_way(
         self, rule_id: int, stop_id: int | None, yielding: Sequence[int], first: Sequence[int]
     ) -> None:
-        """Write the rule by which lanes ``yielding`` wait for lanes that go ``first``."""
+        """Write the rule that lanes ``yielding`` wait for lanes that go ``first``."""
         members = [] if stop_id is None else [("way", stop_id, "ref_line")]
         members += [("relation", self._numbers[lane], "yield") for lane in yielding]
         members += [("relation", self._numbers[lane], "right_of_way") for lane in first]

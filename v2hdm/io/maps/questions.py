@@ -76,7 +76,7 @@ def read_answers(path: Path, origin: GeodeticOrigin | None) -> list[Answer]:
         if subject not in SUBJECTS:
             subjects = ", ".join(SUBJECTS)
             raise MapFileError(
-                f"{where}: {shown(subject)} is no subject of a question; give one of {subjects}"
+                f"{where}: {shown(subject)} is not a subject of a question; give one of {subjects}"
             )
         places = _places(entry.get("geometry"), origin, where)
         to_map = places[-1] if len(places) > 1 else None

@@ -168,7 +168,7 @@ def _widths_m(points: FloatArray, ahead: FloatArray, border: FloatArray) -> Floa
 
 _AT_ONCE = 64  # neighbouring points whose widths are computed at once; chosen
 _WIDEST_M = 12.0  # reach, m, within which the other side of a lane lies; chosen
-_LONGER_M = 3.0  # length, m, by which a border goes on straight beyond its ends, which may be askew; chosen
+_LONGER_M = 3.0  # straight extension of a border beyond its ends, m, which may be askew; chosen
 
 
 def _ahead(step: FloatArray, which: int) -> FloatArray:

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.adjust import Problem, Solution
+from v2hdm.adjust.sections.joined import JoinedCovariance
 from v2hdm.adjust.sections.parts import Part
 from v2hdm.adjust.sections.rounds import save_part
+from v2hdm.adjust.sections.solve import ROUGH_GAP
 from v2hdm.adjust.selection import busiest
 from v2hdm.association.groups import known_elsewhere
 from v2hdm.errors import AdjustError, MappingError
@@ -33,6 +35,7 @@ from v2hdm.mapping.recovery import Examined, Outcome, clocks_of, examine, read_o
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sections.common import Alone, Names
 from v2hdm.mapping.sections.joint import Fit, Gate, Judged, Passed, Told, final_of, fit_of, judged_of
+from v2hdm.mapping.sections.ours import near_corners, of_ours
 from v2hdm.mapping.sections.section import Section
 from v2hdm.progress import Progress, silent
 from v2hdm.records import BoolArray, FloatArray, Image, ImageDetections, IntArray
@@ -126,6 +129,8 @@ class Work:
         detections = self.detections_of(section.drive.images, section.images)
         inputs = Inputs(section.drive, detections, self.cameras, self.options)
         try:
+            # All sections together are solved again, to the end.
+            inputs.optimiser.settled_gap = ROUGH_GAP
             examined = examine(inputs, lambda step: None)
         except MappingError as failure:
             raise MappingError(f"{section.name}: {failure}") from None
@@ -138,7 +143,8 @@ class Work:
             )
         settled = examined.settled
         optimiser = examined.inputs.optimiser
-        self.write("examined", number, examined._replace(settled=_bare(settled)))
+        kept = Examined(examined.inputs.without_markings(), _bare(settled), examined.evidence)
+        self.write("examined", number, kept)
         association = settled.association
         rows = np.flatnonzero(association.group >= 0)
         is_own = section.is_own[optimiser.sightings.image[rows]]
@@ -314,9 +320,12 @@ class Work:
         final = final_of(section, self._examined(number), names, passed, told, joint, scatter)
         assert self.model is not None
         final = replace(final, bundle=replace(final.bundle, model=self.model))
-        proposal = proposed(final)
-        self.write("final", number, replace(final, bundle=_bare(final.bundle)))
         ours = names.is_ours
+        near = near_corners(final.bundle, ours)
+        covariance = _joined(solution).with_pairs(near.first, near.second)
+        self.write("pairs", number, covariance.pairs)
+        proposal = proposed(of_ours(_with_covariance(final, covariance), ours))
+        self.write("final", number, replace(final, bundle=_bare(final.bundle)))
         return Proposal(
             solved=proposal.solved.subset(ours),
             kinds=tuple(final.sightings.kinds[kind] for kind in proposal.kind[ours].tolist()),
@@ -366,11 +375,9 @@ class Work:
         section: Section = self.read("section", number)
         names: Names = self.read("names", number)
         examined = self._examined(number)
-        final = self._final(number)
+        covariance = replace(_joined(solution), pairs=self.read("pairs", number))
+        final = _with_covariance(self._final(number), covariance)
         bundle = final.bundle
-        joint = replace(bundle.solution, covariance=solution.covariance)
-        bundle = replace(bundle, solution=joint)
-        final = replace(final, bundle=bundle)
         noises = section.drive.noises
         clocks = None
         if self.clock_root is None:
@@ -455,6 +462,18 @@ def classified_of(classified: Classified, rows: IntArray, names: Names, kinds: S
 
 def _grey_of(grey: GreyOf, images: Sequence[Image], image: int) -> NDArray[np.float32]:
     return grey(images[image])
+
+
+def _joined(solution: Solution) -> JoinedCovariance:
+    covariance = solution.covariance
+    assert isinstance(covariance, JoinedCovariance)
+    return covariance
+
+
+def _with_covariance(final: FinalSolve, covariance: JoinedCovariance) -> FinalSolve:
+    bundle = final.bundle
+    solution = replace(bundle.solution, covariance=covariance)
+    return replace(final, bundle=replace(bundle, solution=solution))
 
 
 def _bare(bundle: Bundle) -> Bundle:

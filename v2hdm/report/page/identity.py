@@ -30,7 +30,7 @@ class Identity(NamedTuple):
 
 
 def identity_of(facts: Facts, reference: Reference) -> Identity:
-    """All of it; what nobody has stated says so."""
+    """All fields; a field that nobody has stated reads so."""
     job = facts.job.job
     survey = (
         Row("Site", job.site or NOT_STATED),
@@ -57,7 +57,7 @@ def drive_date(facts: Facts) -> str:
         return f"{NOT_STATED}: this result keeps no times of its drive"
     if not all(_FIRST_DATE_S < stamp_s < _LAST_DATE_S for span in spans for stamp_s in span):
         first_s, last_s = spans[0]
-        return f"{NOT_STATED}: the drive's times are no dates, but {first_s:.1f} s to {last_s:.1f} s"
+        return f"{NOT_STATED}: the drive's times are not dates, but {first_s:.1f} s to {last_s:.1f} s"
     return "; ".join(_day(first_s, last_s) for first_s, last_s in spans)
 
 

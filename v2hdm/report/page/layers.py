@@ -148,7 +148,7 @@ def ellipses(markings: Sequence[Marking]) -> FloatArray:
 
 
 def _radii(symbol: Symbol) -> list[float] | None:
-    """The 95 % radii, m, of a symbol's vertices, of which the largest gives the grade."""
+    """The 95 % radii, m, of a symbol's vertices; the largest gives the grade."""
     covariance_m2 = symbol.covariance_m2
     return None if covariance_m2 is None else np.round(corner_radii_m(covariance_m2), 5).tolist()
 

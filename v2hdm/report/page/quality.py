@@ -100,7 +100,7 @@ def _others(facts: Facts) -> list[Sequence[str]]:
             ("Completeness", "rate of omission", f"{omitted} %", f"{rendered}; landmarks driven past")
         )
         extra = number(best.get("false_markings"), 0)
-        rows.append(("Completeness", "number of items that are no markings", extra, rendered))
+        rows.append(("Completeness", "number of mapped items that are not markings", extra, rendered))
     else:
         unknown = "no independent inventory of the site was given"
         rows.append(("Completeness", "omission, commission", _NOT_EVALUATED, unknown))

@@ -56,11 +56,11 @@ def number(value: object, digits: int | None = None, factor: float = 1.0) -> str
 
 
 def probability(value: float) -> str:
-    """A probability of a test as text; one that is too small for three digits says so."""
+    """A test's probability as text; a tiny one is given as an upper limit."""
     return "< 0.001" if value < _LEAST_PROBABILITY else f"{value:.3f}"
 
 
-_LEAST_PROBABILITY = 1e-3  # of a test that is told by its number; below it the number says nothing more
+_LEAST_PROBABILITY = 1e-3  # smallest probability of a test that is printed as a number
 
 
 def name_of(kind: str) -> str:

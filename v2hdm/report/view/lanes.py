@@ -23,10 +23,10 @@ from v2hdm.topology.graph import LaneOfGraph, Question
 
 
 class Lanes:
-    """The lane graph of a map, as its corrections are now; it is made anew where these change it."""
+    """The lane graph of a map with its current corrections; rebuilt when they change it."""
 
     def __init__(self, hd_map: HDMap, trajectories: Sequence[Trajectory]) -> None:
-        """``trajectories`` are of the drives, in the frame of the map."""
+        """``trajectories`` are those of the drives, in the map frame."""
         self._hd_map = hd_map
         self._trajectories = trajectories
         self._lock = threading.Lock()

@@ -62,7 +62,7 @@ class Guard:
         self._base = base
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on to the routes, if it is ours."""
+        """Pass a request of our own page on to the routes."""
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -79,7 +79,7 @@ class Guard:
 
 
 class Once(Generic[Value]):
-    """A value that is made once, by the first request for it."""
+    """A value computed once, at the first request."""
 
     def __init__(self, make: Callable[[], Value]) -> None:
         self._make = make
@@ -87,7 +87,7 @@ class Once(Generic[Value]):
         self._value: Value | None = None
 
     def value(self) -> Value:
-        """It; raises what making it raises."""
+        """The value; raises the error of its computation."""
         with self._lock:
             if self._value is None:
                 self._value = self._make()
@@ -109,7 +109,7 @@ class Shown:
 
 
 class Pages:
-    """The answers, of which the slow ones are made once, by whoever asks first."""
+    """The server's answers; slow ones are computed once, at the first request."""
 
     def __init__(self, shown: Shown) -> None:
         self._shown = shown
@@ -135,7 +135,7 @@ class Pages:
         return Shots.of(self._shown.folder, self._shown.drive)
 
     def page(self, _: Request) -> Response:
-        """The editor; from here on it knows what the file has now."""
+        """The editor page, with the file's current corrections."""
         self._shown.session.state()
         return _asset("editor.html")
 

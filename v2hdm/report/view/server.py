@@ -1,6 +1,6 @@
 """The server of ``v2hdm view``: a port of this machine, and uvicorn behind it.
 
-Its address is told before the libraries of the server are loaded: whoever connects meanwhile waits for them.
+Its address is printed before the server's libraries are loaded; a client that connects meanwhile waits.
 """
 
 from __future__ import annotations

@@ -166,7 +166,7 @@ class Session:
         return _Change(key, correction, before)
 
     def _kept(self, entry: object) -> Correction:
-        """A correction as it will be read again."""
+        """A correction after writing and reading it."""
         where = f"{self.path}: the new correction"
         text = dump_yaml(entry_of(correction_of(entry, where)))
         return correction_of(parse_yaml(text, where, MapFileError), where)

@@ -96,7 +96,7 @@ class TileSource:
             ) from None
         kind = next((name for begin, name in _IMAGES.items() if content.startswith(begin)), None)
         if kind is None or len(content) > _MOST_BYTES:
-            raise ConfigError(f"--background {self.host}: its tile is no PNG, JPEG or WebP; check it")
+            raise ConfigError(f"--background {self.host}: its tile is not a PNG, JPEG or WebP; check it")
         return Tile(content, kind)
 
 

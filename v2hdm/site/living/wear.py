@@ -135,24 +135,18 @@ def _shares_of_side(side_m: float, least: int, most: int) -> FloatArray:
 
 def with_wear(
     hd_map: HDMap,
-    images: Sequence[Image],
-    map_from_vehicle: Sequence[FloatArray],
-    calibrations: Mapping[str, Calibration],
+    footage: Footage,
     grey: Callable[[Image], NDArray[np.float32]],
     shown: Set[tuple[int, int]],
     earlier: HDMap | None = None,
     threads: int = 1,
-    surface: Surface | None = None,
 ) -> HDMap:
     """``hd_map`` with the fraction of paint left of each marking that two or more images show near.
 
-    ``map_from_vehicle`` (4, 4) are the poses of the ``images`` on the flat road, ``grey`` reads one (H, W),
-    ``shown`` are (image, marking) pairs without occlusion. A marking of the ``earlier`` map, by id, states
-    the change, and keeps its earlier value if unseen here.
+    ``grey`` reads an image of the ``footage`` (H, W); ``shown`` are (image, marking) pairs without occlusion.
+    A marking of the ``earlier`` map with the same id states the change, and keeps its value if unseen here.
     """
     cells = [Cells.of(marking.corners_map) for marking in hd_map.markings]
-    ground = None if surface is None else surface.seen_from(np.array(map_from_vehicle))
-    footage = Footage(images, map_from_vehicle, calibrations, ground)
     for number, light in _lights(cells, footage, _best_views(cells, footage, shown), grey, threads):
         cells[number].add(light)
     measured = [k for k, cells_of_marking in enumerate(cells) if len(cells_of_marking.contrasts) >= _VIEWS[0]]

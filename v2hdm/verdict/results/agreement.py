@@ -27,16 +27,14 @@ _LEAST_OFFSET_M = 0.03  # a smaller offset is no finding, however sure it is: co
 
 _MOUNTING_LIMIT_SIGMAS = 5.0
 """Largest deviation of a camera's mounting, solved alone, from that solved with all cameras, in the sigmas of
-the former: below 2 on clean drives."""
+the drift: below 2 on clean drives."""
 
 _GROUND_LIMIT_SIGMAS = 4.0
 """Largest root mean square of a mounting's deviations, in the sigmas of both: less than one in a million by
 chance."""
 
 _LEAST_TURN_DEG = 0.2  # smallest angle between two mountings at which bare ground is the better judge
-_LEAST_HEIGHT_M = (
-    0.04  # smallest difference of two mountings' heights at which bare ground is the better judge
-)
+_LEAST_HEIGHT_M = 0.04  # least height difference, m, at which bare ground is the better judge
 _OVERLAP = 0.1  # share of the smaller of two markings of a class that both cover; paint does not lie on paint
 _DOUBLES_LIMIT = 0.02  # share of markings that overlap another: none on clean drives, 0.01 on old paint
 

@@ -29,7 +29,7 @@ _IMAGE_WORDS = frozenset(
     {"image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "compressed",
      "camera", "cameras", "sensing", "sensors", "raw", "image_raw_compressed"}
 )  # fmt: skip
-_SAME_TIME_S = 1e-4  # by which stamps of one image on two topics differ: some nodes round them
+_SAME_TIME_S = 1e-4  # largest difference of one image's stamps on two topics, s: some nodes round them
 _OFTEN = 1.5  # how many times the messages of another topic make that the better one
 _SAME_LENS = 1e-6  # relative difference of intrinsics that are the same
 
@@ -169,7 +169,7 @@ def _relation(topic: CameraTopic, twin: CameraTopic) -> str:
 
 
 def _base(name: str) -> str:
-    """A topic's name without the end by which ``image_transport`` tells its forms apart."""
+    """A topic's name without the suffix that ``image_transport`` adds for each encoding."""
     for transport in _TRANSPORTS:
         name = name.removesuffix(transport)
     return name

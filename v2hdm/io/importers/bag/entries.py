@@ -37,7 +37,7 @@ LEVER_ARM = "m forward, left, up from {origin}: [1.2, 0, 1.8]"
 _MAPS = ("map", "odom")
 _TURNED = 1e-6  # elements of a rotation that are closer to the identity's are so by rounding
 _ANTENNA = re.compile(r"gps|gnss|antenna|rtk|navsat", re.IGNORECASE)
-_PLACES = ("mounting", "cam_from_vehicle", "ipm")  # keys of which one says where a camera is
+_PLACES = ("mounting", "cam_from_vehicle", "ipm")  # keys that can state a camera's mounting; one is enough
 _OF_FILES = ("tum", "csv", "nmea", "sbet", "pos", "ubx")  # keys of poses that are not of the bag
 
 
@@ -262,7 +262,7 @@ def _heading_of(
 
 
 def _lever_arm(recording: Recording, position: PoseSample) -> str:
-    """The question for the place on the vehicle that positions are of, where nothing tells."""
+    """The question which point on the vehicle the positions refer to, if nothing says it."""
     if not position.frame and position.kind not in (kinds.FIX, kinds.NMEA):
         return (
             f"{position.name} does not say of which frame its poses are: that frame's origin, m "

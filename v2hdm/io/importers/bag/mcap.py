@@ -16,7 +16,7 @@ ROS2 = "cdr"
 _MAGIC = b"\x89MCAP0\r\n"
 _PROFILE_AT = 17  # behind the magic, the code of the first record and its length
 _PROFILE = b"\x04\x00\x00\x00ros2"  # a text's length and the text; a header is never shorter than that
-_DEFINITIONS = {"ros1msg": "ros2msg"}  # of types: the grammar is one
+_DEFINITIONS = {"ros1msg": "ros2msg"}  # of types: both use the same grammar
 _KNOWN = ("ros2msg", "ros2idl", "omgidl", "")
 
 

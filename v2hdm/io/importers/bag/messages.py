@@ -219,8 +219,8 @@ _QUALITY_OF_STATUS = {0: 1, 1: 2, 2: 4}
 _GROUND_BASED = 2  # the status of a NavSatFix with ground-based augmentation, as RTK is
 _FIXED_SIGMA_M = 0.1  # largest sigma of a position with fixed ambiguities, m: 0.02, and about 0.5 with float
 _ATTITUDE = slice(4, 9)  # place of quaternion and sigma in a row
-_NORM_TOLERANCE = 1e-2  # by which a recorded quaternion's norm may be off 1; chosen
-_ANY_HEADING_RAD = np.pi / np.sqrt(3)  # standard deviation of a heading of which nothing is known
+_NORM_TOLERANCE = 1e-2  # largest deviation of a recorded quaternion's norm from 1; chosen
+_ANY_HEADING_RAD = np.pi / np.sqrt(3)  # standard deviation of an unknown heading
 _YAW = 35  # place of the variance of yaw among the 36 numbers of a pose's covariance (REP-103)
 
 Row = tuple[float, ...]

@@ -64,7 +64,7 @@ def mount_of(frames: Frames, vehicle: str, names: Sequence[str], camera: str) ->
         ((name, child),) = children.items()
         return Mount(name, child)
     elevation_deg = np.degrees(np.arcsin(np.clip(vehicle_from_cam[2, 2], -1, 1)))
-    problem = f"{frame} is no optical frame: its z axis, along which a camera looks, points "
+    problem = f"{frame} is not an optical frame: its z axis, along which a camera looks, points "
     problem += f"{abs(elevation_deg):.0f} deg {'up' if elevation_deg > 0 else 'down'}"
     if children:
         return Mount("", None, f"{problem}; several hang on it: {', '.join(children)}")

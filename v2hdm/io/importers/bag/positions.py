@@ -114,7 +114,7 @@ def the_one(candidates: Sequence[Candidate]) -> Candidate | None:
 def _doubt_of(pose: PoseSample, moved_m: float, max_sigma_m: float) -> str:
     is_antenna = pose.kind in (kinds.FIX, kinds.NMEA)
     if not is_antenna and not pose.has_heading:
-        return "its orientations are no rotations"
+        return "its orientations are not rotations"
     if not is_antenna and not pose.is_turned and moved_m > _MOVES_M:
         return "its orientation is never set"
     if pose.sigma_m > max_sigma_m:

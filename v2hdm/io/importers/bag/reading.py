@@ -27,7 +27,7 @@ _LIBRARIES = (
     "rosbags.typesys",
 )  # a third of the time to read a short bag
 _METADATA = "metadata.yaml"
-_TIMES = 10  # by which a message or a file may have more bytes than the bag that it is packed in
+_TIMES = 10  # largest ratio of a message's or file's bytes to those of the bag that packs it
 _TIMES_IN_ALL = 100  # the same of all messages: raw pictures of a simulator may pack twenty times
 _SPARE_BYTES = 200_000_000  # which either may have beyond that
 _BLOCK_BYTES = 1 << 20  # that a compressed file is unpacked by
@@ -175,7 +175,7 @@ class Bag:
                 f"{where}: {self.path} has no topic {name}; topics of type {expected}: {fitting}"
             )
         if topic.kind not in kinds:
-            problem = f"topic {name} of {self.path} is of type {topic.kind}, expected {expected}"
+            problem = f"topic {name} of {self.path} has type {topic.kind}, expected {expected}"
             raise DriveError(f"{where}: {problem}; it has: {fitting}")
         if not topic.messages:
             raise DriveError(f"{where}: topic {name} of {self.path} has no messages; record it")
@@ -287,7 +287,7 @@ def _check_plain(path: Path) -> None:
     query = f"SELECT m.name FROM {columns} WHERE {computes} OR {repeats}"
     with opened(path, "immutable=1") as data:
         for (name,) in data.execute(query):
-            raise DriveError(f"{path}: {name} is no plain table of a recording; convert it to MCAP")
+            raise DriveError(f"{path}: {name} is not a plain table of a recording; convert it to MCAP")
         names = {name.lower() for (name,) in data.execute("SELECT name FROM sqlite_master")}
         for table in names & {"topics", "message_definitions"}:
             deque(rows_of(data, path, table), maxlen=0)

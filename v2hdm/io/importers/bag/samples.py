@@ -20,7 +20,7 @@ from v2hdm.io.importers.bag.streams import INFO_KIND, STAMPS, frame_of, stamp_of
 from v2hdm.records import FloatArray, GeodeticOrigin
 from v2hdm.safe.pixels import AS_STORED, pixels_of
 
-POSE_KINDS = kinds.POSE_KINDS[:-1]  # all but transforms, whose topic is not theirs alone
+POSE_KINDS = kinds.POSE_KINDS[:-1]  # without transforms, which share their topic
 
 _IMAGES = 40  # images and lenses that are looked at per topic: times enough to compare two topics
 _POSES = 1000  # poses that are looked at per topic: 10 s of the fastest
@@ -31,7 +31,7 @@ _NEVER_TURNED = 1e-9  # elements of a quaternion that are this near to the ident
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """A topic and what its first messages show; ``problem`` is why they are of no use."""
+    """A topic and what its first messages show; ``problem`` says why they are useless."""
 
     name: str
     kind: str
@@ -270,7 +270,7 @@ def _most(distances_m: FloatArray) -> float:
 
 
 def is_together(stamp_s: Sequence[float], other_s: Sequence[float], apart_s: float) -> bool:
-    """Whether two topics' messages are of the same times, where both were recorded; False without any."""
+    """Whether two topics' messages have the same times while both were recorded; False without messages."""
     if not len(stamp_s) or not len(other_s):
         return False
     begin_s = max(min(stamp_s), min(other_s)) - apart_s

@@ -74,7 +74,7 @@ class Stream(ABC):
         self.needs = needs
 
     def topics(self, bag: Bag) -> Sequence[str]:
-        """The topics to be read; raises DriveError where the bag lacks them or they are of another type."""
+        """The topics to read; raises DriveError if the bag lacks one or has it with another type."""
         return [bag.need(need.topic, need.kinds, need.where).name for need in self.needs]
 
     @abstractmethod

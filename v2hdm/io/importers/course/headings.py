@@ -27,7 +27,7 @@ _WINDOW_S = 3.0  # time over which turns of the gyro and of the course are compa
 _GYRO_SCALES = (0.8, 1.25)  # a gyro's turns over the course's: more is no error of scale; chosen
 _DEGREES = (40.0, 80.0)  # the same of a gyro in degrees per second, 57
 _RADIANS = (0.012, 0.025)  # and of one in radians that is taken for degrees, 1 / 57
-_OFF_SIGMAS = 4.0  # by which the antenna is elsewhere than stated: by chance once in 16,000
+_OFF_SIGMAS = 4.0  # misfit, sigmas, at which the antenna is elsewhere than stated: by chance once in 16,000
 _MISFIT = 3.0  # root mean square of residuals, in sigmas, beyond which a recording is not as it should be
 _DRIFTING = 0.9  # share of the variance of such headings that drifts: neighbours share all positions
 

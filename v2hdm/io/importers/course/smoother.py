@@ -19,7 +19,7 @@ from v2hdm.io.importers.course.terms import WIDTH, Epoch, Shared, State, Term, t
 from v2hdm.records import FloatArray, IntArray
 
 _MOST_STEPS = 60  # Gauss-Newton takes under ten, a vehicle that stands now and then twenty; chosen
-_CONVERGED = 0.1  # squares of residuals, in sigmas, by which a step gains nothing any more; chosen
+_CONVERGED = 0.1  # decrease of the squared residuals, in sigmas, at which to stop; chosen
 _BAND = 2 * WIDTH  # an epoch's unknowns and the next one's
 _SHOWN = 300  # epochs at most whose sigma is computed; those between take the line between them
 _AT_ONCE = 25  # of these that are solved for together: memory

@@ -53,9 +53,7 @@ SLIP = 0.005
 (Pacejka, Tire and Vehicle Dynamics), gives .005 to .01; a stiff axle at a crawl gives none."""
 
 _ACCELERATION = 1.4  # of the speed after a second, m/s: accelerations of 1 m/s2 that last a second
-_STEERING = (
-    0.08  # of the curvature after a second, 1/m: full lock, .2, takes yard tractors two to three seconds
-)
+_STEERING = 0.08  # sigma of a second's change of curvature, 1/m: tractors need 2 to 3 s to full lock
 _SPEED_M_S = 20.0  # standard deviation of the speed before the drive, m/s
 _CURVATURE_PER_M = 0.15  # standard deviation of the curvature before the drive: circles of 7 m
 _SLIP_M = 0.003  # the way sideways after a metre, m: uneven ground; a course of .1 deg over 3 m
@@ -66,7 +64,7 @@ _GYRO_RAD = 1.8e-4  # angle random walk after a second, rad: .01 deg/s per root 
 _WHEELS_M_S = 0.03  # noise of a wheel's speed, m/s: counts of an encoder
 _DRIFT_SHARE = 0.5  # of a position's variance, that drifts: as in records.PoseNoise
 _DRIFT_OVER_M = 30.0  # distance over which a position's drift fades, m: as in records.PoseNoise
-_LEAST_WAY_M = 0.01  # way by which a drift fades at least from epoch to epoch: it fades with time, too
+_LEAST_WAY_M = 0.01  # least way per epoch over which a drift fades, m: it fades with time, too
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,7 @@ class State:
 
 
 def terms_of(course: Course, state: State, way_m: FloatArray) -> list[Term]:
-    """All residuals; ``way_m`` (P - 1,) is the way between epochs, by which noise grows."""
+    """All residuals; ``way_m`` (P - 1,) is the way between epochs; noise grows with it."""
     return [
         _positions(course, state),
         _drifts(course, state, way_m),
