@@ -117,14 +117,15 @@ def test_two_markings_of_one_image_are_never_merged(sightings):
 
 def test_groups_are_renumbered_when_rows_are_dropped_and_are_the_same_under_other_numbers():
     association = Association(np.array([0, 1, 2, 1, -1]), np.arange(5) % 4, 3)
-    renumbered = keep_rows(association, np.array([False, True, True, True, True]))
-    assert (renumbered.group.tolist(), renumbered.count) == ([-1, 0, 1, 0, -1], 2)
-    a, b, c = (
-        Association(np.array(group), np.zeros(5, int), count)
-        for group, count in (([0, 0, 1, 2, -1], 3), ([5, 5, 0, 1, 1], 6), ([5, 0, 0, 1, 1], 6))
+    remaining = keep_rows(association, np.array([False, True, True, True, True]))
+    assert (remaining.group.tolist(), remaining.count) == ([-1, 0, 1, 0, -1], 2)
+    first, renumbered, other, with_a_sighting_more = (
+        Association(np.array(group), np.zeros(5, int), 6)
+        for group in ([0, 0, 1, 2, -1], [5, 5, 0, 1, -1], [5, 0, 0, 1, -1], [0, 0, 1, 2, 2])
     )
-    assert same_groups(a, b)
-    assert not same_groups(a, c)
+    assert same_groups(first, renumbered)
+    assert not same_groups(first, other)
+    assert not same_groups(first, with_a_sighting_more)
 
 
 def test_a_far_sighting_cannot_ruin_the_mean_of_near_ones():

@@ -62,10 +62,12 @@ def keep_rows(association: Association, rows: BoolArray) -> Association:
 
 
 def same_groups(a: Association, b: Association) -> bool:
-    """Whether ``a`` and ``b`` partition the sightings that both group in the same way."""
-    common = (a.group >= 0) & (b.group >= 0)
-    pairs = len(np.unique(np.stack([a.group[common], b.group[common]]), axis=1).T)
-    return pairs == len(np.unique(a.group[common])) == len(np.unique(b.group[common]))
+    """Whether ``a`` and ``b`` group the same sightings, and in the same way."""
+    is_grouped = a.group >= 0
+    if not np.array_equal(is_grouped, b.group >= 0):
+        return False
+    pairs = len(np.unique(np.stack([a.group[is_grouped], b.group[is_grouped]]), axis=1).T)
+    return pairs == len(np.unique(a.group[is_grouped])) == len(np.unique(b.group[is_grouped]))
 
 
 @dataclass(frozen=True)
