@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from v2hdm.records import FloatArray
 
 _CORNERS_AT_ONCE = 256  # corners whose right-hand sides are solved together: enough for fast products
 _NUMBERS_AT_ONCE = 1 << 25  # most numbers, of 8 bytes, in the right-hand sides that are solved together
+_NUMBERS_KEPT = 1 << 23  # most numbers, of 8 bytes, that are kept of solved right-hand sides: 67 MB; chosen
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,23 @@ class Moves:
             np.concatenate([other.extrinsic, self.extrinsic], axis=2),
             np.concatenate([other.poses, self.poses], axis=2),
         )
+
+
+@dataclass(frozen=True)
+class _Roots:
+    """The columns of :func:`reduced_root` that were solved for so far: each is asked for several times."""
+
+    by_corner: Tensor  # (N, 2, D)
+    is_solved: Tensor  # (N,)
+
+    def of(self, whitening: Whitening, corners: Tensor) -> Tensor:
+        """The rows (2 n, D) of n corners, ascending."""
+        missing = corners[~self.is_solved[corners]]
+        if len(missing):
+            root = reduced_root(whitening, missing)
+            self.by_corner[missing] = root.mT.reshape(len(missing), 2, -1)
+            self.is_solved[missing] = True
+        return self.by_corner[corners].flatten(0, 1)
 
 
 @dataclass(frozen=True)
@@ -137,6 +156,22 @@ class Covariance:
         if part:
             yield np.array(part)
 
+    @cached_property
+    def _roots(self) -> _Roots | None:
+        """What is kept of solved right-hand sides; None where there is too much of it."""
+        size = self.whitening.reduced_factor.size
+        count = self.whitening.engine.arrays.corner_count
+        if 2 * count * size > _NUMBERS_KEPT:
+            return None
+        tip = self.whitening.reduced_factor.tip
+        return _Roots(tip.new_empty(count, 2, size), tip.new_zeros(count, dtype=torch.bool))
+
+    def _root(self, corners: Tensor) -> Tensor:
+        """The transpose (2 n, D) of :func:`reduced_root` of n corners, ascending."""
+        if self._roots is None:
+            return reduced_root(self.whitening, corners).mT
+        return self._roots.of(self.whitening, corners)
+
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
         arrays = self.whitening.engine.arrays
         rank = torch.argsort(arrays.corner_order)
@@ -144,9 +179,9 @@ class Covariance:
         # Known lengths couple V^-1 of corners to others outside their group.
         joined = _with_joined(arrays, chosen)
         corners = torch.unique(joined)
-        root = reduced_root(self.whitening, corners)
-        # Of what is eliminated before the corners' frames the rows are zero: often half of them.
-        by_near = root[root.any(dim=1)].T[_columns(corners, joined)]
+        root = self._root(corners)
+        # Of what is eliminated before the corners' frames the columns are zero: often half of them.
+        by_near = root[:, root.any(dim=0)][_columns(corners, joined)]
         # V^-1 of the corners and all joined ones; 1 for kept corners.
         unit = torch.eye(2 * len(corners), dtype=torch.float64, device=corners.device)
         factor = self.whitening.linearised.corner_factor.take(corners)

@@ -27,7 +27,7 @@ Evaluate = Callable[[Tensor], tuple[float, Tensor]]  # cost and gradient at whit
 _LBFGS: dict[str, Any] = {
     "line_search_fn": "strong_wolfe",
     "history_size": 20,
-    "max_eval": 50,
+    "max_eval": 100,
     "tolerance_grad": 0.0,
     "tolerance_change": 0.0,
 }
@@ -177,9 +177,9 @@ class _Search:
 
 _ANNEALING_TOLERANCE = 1e-3  # while a robust loss is being narrowed, more digits are wasted
 _ANNEALING_STEP = 3.0  # least factor that narrows a robust loss from whitening to whitening
-_ITERATIONS_PER_WHITENING = 12  # most steps of LBFGS under one whitening
+_ITERATIONS_PER_WHITENING = 30  # most steps of LBFGS under one whitening
 RENEWAL = 2.0  # cost of a whitening, in evaluations, if frames have no states
-RENEWAL_WITH_STATES = 10.0  # cost of a whitening, in evaluations, if frames have states
+RENEWAL_WITH_STATES = 25.0  # cost of a whitening, in evaluations, if frames have states
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
 from v2hdm.adjust.model import Estimate, Loss, depression_sine, frame_tangent
 from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status, as_of_point, classify, noise_scale, variance_factors
+from v2hdm.adjust.split import likeliest_states
 from v2hdm.adjust.threads import one_thread_in_torch
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.doors import checked
@@ -252,14 +253,18 @@ def _estimate(problem: Problem, engine: TorchEngine, cam_from_vehicle: Tensor) -
 
 
 def _states_start(problem: Problem, arrays: Arrays) -> Tensor:
-    """States (J, S) whose poses are where the problem starts, in the first state of each axis."""
-    state = torch.zeros_like(arrays.state_information_root)
-    if problem.poses_start is None:
-        return state
+    """States (J, S) whose poses are where the problem starts, the likeliest such."""
+    zero = torch.zeros_like(arrays.state_information_root)
+    if problem.poses_start is None or not arrays.states:
+        return zero
     tangent = log(np.linalg.inv(problem.map_from_vehicle) @ problem.poses_start)
-    for axis in sorted(set(arrays.states)):
-        state[:, arrays.states.index(axis)] = state.new_tensor(tangent[:, axis])
-    return state
+    states = likeliest_states(
+        tangent,
+        arrays.states,
+        arrays.state_transition.cpu().numpy(),
+        arrays.state_information_root.cpu().numpy(),
+    )
+    return zero.new_tensor(states)
 
 
 def report_of(

@@ -205,7 +205,7 @@ class Optimiser:
         of_camera = self.sightings.camera[settled.row] == self.camera_names.index(camera)
         usable = np.zeros_like(self.sightings.valid)
         usable[settled.row[of_camera], settled.own_corner[of_camera]] = True
-        return self._solve(settled.association, usable, settled.rig)
+        return self._solve(settled.association, usable, settled.rig, is_near=True)
 
     def _with_errors_of_ground(self, bundle: Bundle) -> Bundle:
         """``bundle`` with covariances inflated by the uncertainty of its ground's heights."""

@@ -28,11 +28,12 @@ class Pairs(NamedTuple):
 def near_corners(bundle: Bundle, is_ours: BoolArray) -> Pairs:
     """The corners of groups ``is_ours`` (G,) with those of their own and of neighbours.
 
-    Whoever states a marking's place beside its neighbours asks for these.
+    Whoever states a marking's place beside its neighbours asks for these. Two of the neighbours may be twice
+    as far apart as each is from the marking.
     """
     groups = np.flatnonzero(is_ours & (bundle.corner_index >= 0).any(axis=1))
     centres_map = np.nanmean(bundle.corners_map[groups], axis=1)
-    near = cKDTree(centres_map).query_pairs(FARTHEST_M + _MOVED_M, output_type="ndarray")
+    near = cKDTree(centres_map).query_pairs(2 * FARTHEST_M + _MOVED_M, output_type="ndarray")
     alone = np.repeat(np.arange(len(groups)), 2).reshape(-1, 2)
     corners = bundle.corner_index[groups][np.concatenate([alone, near])]
     first, second = np.broadcast_arrays(corners[:, 0, :, None], corners[:, 1, None, :])

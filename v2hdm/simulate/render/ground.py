@@ -14,9 +14,11 @@ from v2hdm.records import FloatArray
 from v2hdm.simulate.render import kernels
 from v2hdm.simulate.render.relief import Relief, meet_ground
 from v2hdm.simulate.render.scene import (
+    Box,
     Float32,
     Ground,
     GroundMarks,
+    Light,
     Paint,
     Shade,
     Shadow,
@@ -163,7 +165,7 @@ def _sample_smooth(tile: Tile, field: GroundField, shift: tuple[float, float]) -
     small = sample(tile, field.x_m[::4, ::4], field.y_m[::4, ::4], shift)
     height, width = field.x_m.shape
     full = cv2.resize(small, (small.shape[1] * 4, small.shape[0] * 4), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(full[:height, :width], dtype=np.float32)
+    return np.ascontiguousarray(full[:height, :width], dtype=np.float32)
 
 
 def _slabs(ground: Ground, slab_m: tuple[float, float], field: GroundField, out: Float32) -> None:
@@ -205,6 +207,15 @@ def wetness(ground: Ground, field: GroundField) -> Float32:
     level = float(np.quantile(WET_TILE.values[::8, ::8], 1.0 - ground.wet_fraction))
     values = _sample_smooth(WET_TILE, field, texture_shift(ground.seed + 1))
     return smoothstep(values, level - 0.1, level + 0.3)
+
+
+def may_cast(box: Box, light: Light, view: View) -> bool:
+    """Whether the shadow of a box may be near enough to a camera to be seen."""
+    east, north, up = light.sun_direction_map
+    falls = np.hypot(east, north) / max(up, 0.1)
+    reach_m = np.hypot(box.size_m[0], box.size_m[1]) / 2 + (box.base_m + box.size_m[2]) * falls
+    offset_map = np.array(box.centre_map) - view.centre_map[:2]
+    return bool(np.hypot(offset_map[0], offset_map[1]) < _SHADOWS_TO_M + reach_m)
 
 
 class ShadowLayer:

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
+from numba.np import arrayobj
 from numpy.typing import NDArray
 
 from v2hdm.compiled import exact_kernel, exactly_inlined
@@ -17,13 +19,17 @@ from v2hdm.records import FloatArray, IntArray
 from v2hdm.simulate.render.scene import TILE_PX
 
 _Plane = NDArray[np.float32]
+_numba_arrays: Any = arrayobj  # which states no types
+_numba_code: Any = cgutils
 _f = np.float32
+_i = np.int32
 
 # Numbers in float32: an operand in float64 would widen what a kernel computes.
 _TILE = _f(TILE_PX)  # side of a tile, px
 _ONE = _f(1.0)  # a whole pixel, and a tone that changes nothing
 _HALF = _f(0.5)  # half a pixel, from which on it counts as covered
 _ZERO = _f(0.0)  # none of a pixel
+_NEXT = _i(1)  # from a row or column to the following one
 
 
 def _rounded_once(_: Any, a: Any, b: Any, c: Any) -> Any:
@@ -35,6 +41,52 @@ def _rounded_once(_: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 _fma: Any = intrinsic(_rounded_once)  # a b + c rounded once, as in cv2.remap
+
+
+def _place(context: Any, builder: Any, kind: Any, plane: Any, row: Any, column: Any) -> Any:
+    """The address of a pixel of a plane (H, W), by numbers of 32 bits: processors gather by those fastest."""
+    array = _numba_arrays.make_array(kind)(context, builder, plane)
+    width = builder.trunc(_numba_code.unpack_tuple(builder, array.shape, 2)[1], row.type)
+    flat = builder.add(builder.mul(row, width, flags=["nsw"]), column, flags=["nsw"])
+    return builder.gep(array.data, [builder.sext(flat, cgutils.intp_t)])
+
+
+def _what_is_read(builder: Any) -> Any:
+    """LLVM's name of all that :data:`_read` reads."""
+    module = builder.module
+    domain = module.add_metadata(["v2hdm pixels"])
+    return module.add_metadata([module.add_metadata(["v2hdm read", domain])])
+
+
+def _marked_read(_: Any, plane: Any, row: Any, column: Any) -> Any:
+    if plane.layout != "C":
+        return None  # numba then refuses the call
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        value = builder.load(_place(context, builder, signature.args[0], *arguments))
+        value.set_metadata("alias.scope", _what_is_read(builder))
+        return value
+
+    return types.float32(plane, types.int32, types.int32), build
+
+
+def _marked_write(_: Any, plane: Any, row: Any, column: Any, value: Any) -> Any:
+    if plane.layout != "C":
+        return None
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        *place, number = arguments
+        stored = builder.store(number, _place(context, builder, signature.args[0], *place))
+        stored.set_metadata("noalias", _what_is_read(builder))
+        return context.get_dummy_value()
+
+    return types.none(plane, types.int32, types.int32, types.float32), build
+
+
+# Reads of planes to which no ``_write`` of their kernel writes. LLVM cannot know that of a texture, whose
+# pixels it would otherwise take one by one: with it a kernel takes less than half of the time.
+_read: Any = intrinsic(_marked_read)
+_write: Any = intrinsic(_marked_write)
 
 
 @exactly_inlined
@@ -55,12 +107,16 @@ def _sample(tile: _Plane, x_m: Any, y_m: Any, per_metre: Any, turn_x: Any, turn_
     """A padded tile's value at a ground point, as :func:`v2hdm.simulate.render.scene.sample` has it."""
     x = _wrap(x_m, per_metre, turn_x)
     y = _wrap(y_m, per_metre, turn_y)
-    column = int(x)
-    row = int(y)
+    column = _i(x)
+    row = _i(y)
     share_x = x - _f(column)
     share_y = y - _f(row)
-    above = _fma(share_x, tile[row, column + 1] - tile[row, column], tile[row, column])
-    below = _fma(share_x, tile[row + 1, column + 1] - tile[row + 1, column], tile[row + 1, column])
+    right = _i(column + _NEXT)
+    under = _i(row + _NEXT)
+    upper = _read(tile, row, column)
+    lower = _read(tile, under, column)
+    above = _fma(share_x, _read(tile, row, right) - upper, upper)
+    below = _fma(share_x, _read(tile, under, right) - lower, lower)
     return _fma(share_y, below - above, above)
 
 
@@ -267,17 +323,66 @@ def ground_tone(
     """Write the relative reflectance (H', W) by grain, stains and ``coarse`` stains (H', W)."""
     fine, medium = tiles
     x_m, y_m, footprint_m = ground
-    for row in range(out.shape[0]):
-        for column in range(out.shape[1]):
-            x = x_m[row, column]
-            y = y_m[row, column]
-            footprint = footprint_m[row, column]
-            noise = _sample(fine, x, y, scales[0, 0], scales[0, 1], scales[0, 2])
-            tone = noise * (_fade(footprint, scales[0, 3]) * amplitudes[0])
-            noise = _sample(medium, x, y, scales[1, 0], scales[1, 1], scales[1, 2])
-            tone += noise * (_fade(footprint, scales[1, 3]) * amplitudes[1])
-            tone += coarse[row, column] * amplitudes[2]
-            out[row, column] = _clip(tone + _ONE, _f(0.25), _f(2.5))
+    # Read once, here: LLVM would not know that they stay the same.
+    fine_per_m = scales[0, 0]
+    fine_x = scales[0, 1]
+    fine_y = scales[0, 2]
+    fine_per_wave = scales[0, 3]
+    medium_per_m = scales[1, 0]
+    medium_x = scales[1, 1]
+    medium_y = scales[1, 2]
+    medium_per_wave = scales[1, 3]
+    grain = amplitudes[0]
+    stains = amplitudes[1]
+    large = amplitudes[2]
+    for row_number in range(out.shape[0]):
+        for column_number in range(out.shape[1]):
+            row = _i(row_number)
+            column = _i(column_number)
+            x = _read(x_m, row, column)
+            y = _read(y_m, row, column)
+            footprint = _read(footprint_m, row, column)
+            noise = _sample(fine, x, y, fine_per_m, fine_x, fine_y)
+            tone = noise * (_fade(footprint, fine_per_wave) * grain)
+            noise = _sample(medium, x, y, medium_per_m, medium_x, medium_y)
+            tone += noise * (_fade(footprint, medium_per_wave) * stains)
+            tone += _read(coarse, row, column) * large
+            _write(out, row, column, _clip(tone + _ONE, _f(0.25), _f(2.5)))
+
+
+@exact_kernel
+def spread(tone: _Plane, colour: _Plane, out: _Plane) -> None:
+    """Write a tone (H', W) times a colour (3,) into ``out`` (H', W, 3)."""
+    for row in range(tone.shape[0]):
+        for column in range(tone.shape[1]):
+            for c in range(3):
+                out[row, column, c] = tone[row, column] * colour[c]
+
+
+@exact_kernel
+def draw_sky(
+    azimuth: _Plane, elevation: _Plane, clouds: _Plane, scale: _Plane, sky: _Plane, skyline: _Plane,
+    per_turn: Any, height_rad: Any, per_focal: Any, out: _Plane,
+) -> None:  # fmt: skip
+    """Write sky and skyline (R, W, 3) by each pixel's direction (R, W), rad.
+
+    ``sky`` (3, 3) is the colour at the horizon, by how much the zenith differs, and the walls'; ``skyline``
+    (2, blocks) has heights and tones of blocks, ``per_turn`` of them a rad.
+    """
+    blocks = skyline.shape[1]
+    for row in range(azimuth.shape[0]):
+        for column in range(azimuth.shape[1]):
+            turn = azimuth[row, column]
+            up = elevation[row, column]
+            cloud = _sample(clouds, turn, up * _f(2.0), scale[0], scale[1], scale[2])
+            bright = _ONE + _f(0.05) * cloud
+            share = _f(np.sqrt(_clip(up * _f(2.2), _ZERO, _ONE)))
+            block = int(np.floor((turn + _f(np.pi)) * per_turn)) % blocks
+            above = skyline[0, block] * height_rad - up
+            covered = _clip(above / per_focal + _HALF, _ZERO, _ONE)
+            for c in range(3):
+                lit = (sky[0, c] + sky[1, c] * share) * bright
+                out[row, column, c] = lit + covered * (sky[2, c] * skyline[1, block] - lit)
 
 
 @exact_kernel
@@ -315,8 +420,8 @@ def _at_border(place: int, size: int) -> int:
 
 
 @exact_kernel
-def blur_along(image: _Plane, flow: _Plane, out: _Plane) -> None:
-    """Write the mean (H, W, 3) of an image and of it moved by the flow (H, W, 2) px either way."""
+def blur_along(image: _Plane, flow: _Plane, share: Any, out: _Plane) -> None:
+    """Write the mean (H, W, 3) of an image and of it moved by a share of the flow (H, W, 2) px either way."""
     height = image.shape[0]
     width = image.shape[1]
     for row in range(height):
@@ -324,8 +429,8 @@ def blur_along(image: _Plane, flow: _Plane, out: _Plane) -> None:
             for c in range(3):
                 out[row, column, c] = image[row, column, c]
             for sign in (_f(-1.0), _ONE):
-                x = _f(column) + sign * flow[row, column, 0]
-                y = _f(row) + sign * flow[row, column, 1]
+                x = _f(column) + sign * (flow[row, column, 0] * share)
+                y = _f(row) + sign * (flow[row, column, 1] * share)
                 floor_x = _f(np.floor(x))
                 floor_y = _f(np.floor(y))
                 share_x = x - floor_x
@@ -345,19 +450,18 @@ def blur_along(image: _Plane, flow: _Plane, out: _Plane) -> None:
 
 @exact_kernel
 def record(
-    image: _Plane,
-    noise: _Plane,
-    per_electron: Any,
-    dark: Any,
-    codes: NDArray[np.uint8],
-    out: NDArray[np.uint8],
-) -> None:
-    """Write the codes (H, W, 3) of an exposed image with shot noise and noise in the dark."""
+    image: _Plane, gain: _Plane, falloff: _Plane, noise: _Plane, per_electron: Any, dark: Any,
+    codes: NDArray[np.uint8], out: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Write the codes (H, W, 3) of an image with shot noise and noise in the dark.
+
+    It is exposed by a ``gain`` (3,) and the lens's ``falloff`` (H, W).
+    """
     steps = _f(len(codes) - 1)
     for row in range(image.shape[0]):
         for column in range(image.shape[1]):
             for c in range(3):
-                level = image[row, column, c]
+                level = image[row, column, c] * gain[c] * falloff[row, column]
                 sigma = _f(np.sqrt(max(level, _ZERO) * per_electron + dark))
                 level = (level + sigma * noise[row, column, c]) * steps
                 out[row, column, c] = codes[int(_clip(level, _ZERO, steps))]

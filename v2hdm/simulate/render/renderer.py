@@ -34,7 +34,6 @@ from v2hdm.simulate.render.scene import (
     box_faces,
     box_shadow,
     noise_tile,
-    sample,
     scale_of,
 )
 from v2hdm.simulate.render.view import Outline, View, bands_of, camera_rays, edges_of, in_view, outlines
@@ -46,11 +45,13 @@ _FARTHEST_M = 250.0  # largest depth of boxes that are drawn
 
 @dataclass(frozen=True)
 class _Face:
-    """A rectangle: its corners (4, 3), its normal, and whether it is a side of its box."""
+    """A rectangle of a box: its corners (4, 3), its normal, and whether it is a side."""
 
+    box: Box
     corners_map: FloatArray
     normal: FloatArray
     upright: bool
+    lit_bgr: Bgr
     picture: Picture | None = None
 
     @cached_property
@@ -64,29 +65,45 @@ class _Face:
         """Lengths (2,) of the edges from the first corner to the second and to the last."""
         return np.asarray(np.linalg.norm(self.corners_map[[1, 3]] - self.corners_map[0], axis=1))
 
+    @cached_property
+    def plain_colour(self) -> Float32:
+        """Radiance (3, 1, 1) of its box's colour."""
+        lit = [albedo * light for albedo, light in zip(self.box.albedo_bgr, self.lit_bgr, strict=True)]
+        return np.array(lit, dtype=np.float32).reshape(3, 1, 1)
+
+    @cached_property
+    def dirt_scale(self) -> Float32:
+        """Where the dirt's texture lies on it, as kernels take it."""
+        offset = (float(self.box.seed % 101) * 0.37, float(self.box.seed % 71) * 0.29)
+        return np.array(scale_of(_DIRT_TILE, offset), dtype=np.float32)
+
 
 @dataclass(frozen=True)
 class _Standing:
-    """Boxes with their faces, prepared once."""
+    """Boxes in a light, prepared once; the faces of each when it first comes into view."""
 
     boxes: tuple[Box, ...]
     corners_map: FloatArray  # (B, 8, 3)
-    faces: list[list[_Face]]
+    light: Light
+    faces: dict[int, list[_Face]]
 
     @classmethod
-    def of(cls, boxes: tuple[Box, ...]) -> _Standing:
+    def of(cls, boxes: tuple[Box, ...], light: Light) -> _Standing:
         """All that does not depend on the camera."""
         corners_map = np.array([box_faces(box).reshape(8, 3) for box in boxes]).reshape(-1, 8, 3)
-        return cls(boxes, corners_map, [_faces(box) for box in boxes])
+        return cls(boxes, corners_map, light, {})
 
     def visible(self, view: View) -> list[tuple[Box, list[_Face]]]:
         """The boxes that may reach into the image."""
         chosen = in_view(view, view.homogeneous_px(self.corners_map), _FARTHEST_M).tolist()
+        for number in chosen:
+            if number not in self.faces:
+                self.faces[number] = _faces(self.boxes[number], self.light)
         return [(self.boxes[number], self.faces[number]) for number in chosen]
 
 
 def draw_boxes(
-    standing: Sequence[_Standing], light: Light, view: View, radiance: Float32, hidden: NDArray[np.bool_]
+    standing: Sequence[_Standing], view: View, radiance: Float32, hidden: NDArray[np.bool_]
 ) -> None:
     """Draw boxes over ``radiance`` (H, W, 3) and mark in ``hidden`` (H, W) what lies behind them."""
     centre = view.centre_map
@@ -99,18 +116,15 @@ def draw_boxes(
     # Of stacked boxes the upper comes first: its underside lies behind the one below.
     ordered = sorted(visible, key=lambda b: (distance(b[0]), b[0].base_m), reverse=True)
     turned = [
-        (box, face)
-        for box, faces in ordered
-        for face in faces
-        if (centre - face.corners_map[0]) @ face.normal > 1e-3
+        face for _, faces in ordered for face in faces if (centre - face.corners_map[0]) @ face.normal > 1e-3
     ]
-    shapes = outlines(view, [view.homogeneous_px(face.corners_map) for _, face in turned])
-    for (box, face), shape in zip(turned, shapes, strict=True):
+    shapes = outlines(view, [view.homogeneous_px(face.corners_map) for face in turned])
+    for face, shape in zip(turned, shapes, strict=True):
         if shape is not None:
-            _draw_face(box, face, shape, light, view, radiance, hidden)
+            _draw_face(face, shape, view, radiance, hidden)
 
 
-def _faces(box: Box) -> list[_Face]:
+def _faces(box: Box, light: Light) -> list[_Face]:
     low, high = box_faces(box)
     faces = []
     pictures = (*box.pictures, *(None,) * 6)
@@ -120,49 +134,47 @@ def _faces(box: Box) -> list[_Face]:
         b = low[after, :2]
         along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
         corners = np.array([low[k], low[after], high[after], high[k]])
-        faces.append(_Face(corners, np.array([along[1], -along[0], 0.0]), True, pictures[k]))
+        normal = np.array([along[1], -along[0], 0.0])
+        faces.append(_Face(box, corners, normal, True, _light_on(normal, light), pictures[k]))
     for corners, up, picture in ((high, 1.0, pictures[4]), (low, -1.0, None)):
-        faces.append(_Face(corners, np.array([0.0, 0.0, up]), False, picture))
+        normal = np.array([0.0, 0.0, up])
+        faces.append(_Face(box, corners, normal, False, _light_on(normal, light), picture))
     return faces
 
 
-def _draw_face(
-    box: Box,
-    face: _Face,
-    shape: Outline,
-    light: Light,
-    view: View,
-    radiance: Float32,
-    hidden: NDArray[np.bool_],
-) -> None:
-    sun = max(float(face.normal @ np.array(light.sun_direction_map)), 0.0)
-    sky = 0.55 + 0.45 * face.normal[2]
-    lit = [
-        sun * s + (sky if face.normal[2] >= 0 else 0.35) * d
-        for s, d in zip(light.sun_bgr, light.sky_bgr, strict=True)
-    ]
+def _light_on(normal: FloatArray, light: Light) -> Bgr:
+    """The light of sun and sky that falls on a face."""
+    sun = max(float(normal @ np.array(light.sun_direction_map)), 0.0)
+    sky = 0.55 + 0.45 * normal[2] if normal[2] >= 0 else 0.35
+    blue, green, red = (sun * s + sky * d for s, d in zip(light.sun_bgr, light.sky_bgr, strict=True))
+    return blue, green, red
+
+
+def _draw_face(face: _Face, shape: Outline, view: View, radiance: Float32, hidden: NDArray[np.bool_]) -> None:
     edges = edges_of(shape, grown_px=0.5)
     rays = (view.rays.u_pinhole_px, view.rays.v_pinhole_px)
     face_from_pinhole = _plane_of(face, view)
     per_focal = np.float32(1.0 / view.rays.info.intrinsic[0, 0])
-    offset = (float(box.seed % 101) * 0.37, float(box.seed % 71) * 0.29)
-    scale = np.array(scale_of(_DIRT_TILE, offset), dtype=np.float32)
     waves = np.empty((0, 0), np.float32)
+    dirt = _DIRT_TILE.padded
     windows, count = bands_of(view, shape)
     for window in windows[:count]:
         patch = np.empty((4, window[1] - window[0], window[3] - window[2]), dtype=np.float32)
         if not kernels.look_at_face(window, edges, rays, face_from_pinhole, per_focal, patch):
             continue
-        if box.corrugated and face.upright:
+        if face.box.corrugated and face.upright:
             waves = np.sin(patch[1] * np.float32(2 * np.pi / _CORRUGATION_M))
-        albedo: Bgr | Float32 = box.albedo_bgr
+        colour = face.plain_colour
         if face.picture is not None:
             along_m, up_m, footprint_m = patch[1:]
-            albedo = face.picture(face.sides_m, along_m, up_m, footprint_m)
-        parts = [np.asarray(part * light, dtype=np.float32) for part, light in zip(albedo, lit, strict=True)]
-        colour = np.stack(parts).reshape((3, *(parts[0].shape or (1, 1))))  # (3, 1, 1) where it is one tone
-        dirt = _DIRT_TILE.padded
-        kernels.draw_face(window, patch, dirt, scale, waves, face.upright, colour, radiance, hidden)
+            pictured = face.picture(face.sides_m, along_m, up_m, footprint_m)
+            colour = np.stack(
+                [
+                    np.asarray(part * light, np.float32)
+                    for part, light in zip(pictured, face.lit_bgr, strict=True)
+                ]
+            )
+        kernels.draw_face(window, patch, dirt, face.dirt_scale, waves, face.upright, colour, radiance, hidden)
 
 
 def _plane_of(face: _Face, view: View) -> Float32:
@@ -193,19 +205,22 @@ def draw_background(view: View, light: Light, backdrop: Backdrop, last_row: int)
     x, y, z = (row[0] * u + row[1] * v + row[2] for row in rotation)
     elevation = np.arctan2(z, np.hypot(x, y))
     azimuth = np.arctan2(y, x)
-    height = np.clip(elevation * np.float32(2.2), 0, 1)[..., None]
-    clouds = sample(_CLOUD_TILE, azimuth, elevation * 2)[..., None]
-    horizon, zenith = (np.array(c, dtype=np.float32) for c in (light.horizon_bgr, light.zenith_bgr))
-    out = horizon + (zenith - horizon) * np.sqrt(height)
-    out *= np.float32(1.0) + np.float32(0.05) * clouds
+    horizon, zenith, wall = np.array([light.horizon_bgr, light.zenith_bgr, backdrop.albedo_bgr], np.float32)
     blocks = max(int(2 * np.pi / backdrop.block_rad), 8)
-    skyline = _skyline(backdrop.seed, blocks)
-    turn = (azimuth + np.float32(np.pi)) * np.float32(blocks / (2 * np.pi))
-    index = np.floor(turn).astype(np.int32) % blocks
-    above = skyline[0][index] * np.float32(backdrop.height_rad) - elevation
-    covered = np.clip(above / np.float32(1.0 / view.rays.info.intrinsic[0, 0]) + 0.5, 0, 1)
-    wall = np.array(backdrop.albedo_bgr, dtype=np.float32) * skyline[1][index][..., None]
-    return np.asarray(out + covered[..., None] * (wall - out), dtype=np.float32)
+    out = np.empty((*azimuth.shape, 3), dtype=np.float32)
+    kernels.draw_sky(
+        azimuth,
+        elevation,
+        _CLOUD_TILE.padded,
+        np.array(scale_of(_CLOUD_TILE, (0.0, 0.0)), dtype=np.float32),
+        np.stack([horizon, zenith - horizon, wall]),
+        _skyline(backdrop.seed, blocks),
+        np.float32(blocks / (2 * np.pi)),
+        np.float32(backdrop.height_rad),
+        np.float32(1.0 / view.rays.info.intrinsic[0, 0]),
+        out,
+    )
+    return out
 
 
 RENDERER_VERSION = 2
@@ -240,7 +255,7 @@ class Renderer:
         self._paint = PaintLayer(self.scene.paints, self.classes)
         cast = tuple(box_shadow(box, self.scene.light) for box in self.scene.boxes)
         self._shadows = ShadowLayer(self.scene.shadows + cast)
-        self._standing = _Standing.of(self.scene.boxes)
+        self._standing = _Standing.of(self.scene.boxes, self.scene.light)
 
     def render(
         self,
@@ -261,10 +276,12 @@ class Renderer:
         view = View(camera_rays(info), np.asarray(cam_from_map, dtype=np.float64), self.scene.relief)
         labels = np.zeros((info.height, info.width), dtype=np.uint8)
         hidden = np.zeros((info.height, info.width), dtype=np.bool_)
-        moving_shadows = ShadowLayer([box_shadow(box, self.scene.light) for box in moving_boxes])
-        standing = (self._standing, _Standing.of(moving_boxes))
+        light = self.scene.light
+        casting = [box for box in moving_boxes if on_ground.may_cast(box, light, view)]
+        moving_shadows = ShadowLayer([box_shadow(box, light) for box in casting])
+        standing = (self._standing, _Standing.of(moving_boxes, light))
         radiance = self._surroundings(view, (self._shadows, moving_shadows), labels)
-        draw_boxes(standing, self.scene.light, view, radiance, hidden)
+        draw_boxes(standing, view, radiance, hidden)
         radiance = _motion_blur(radiance, view, motion or Motion())
         if before_lens is not None:
             before_lens(view, radiance, hidden)
@@ -281,7 +298,7 @@ class Renderer:
         sky_rows = np.flatnonzero(~ground.below.all(axis=1))
         last_row = ground.first_row + (int(sky_rows[-1]) + 1 if len(sky_rows) else 0)
         radiance = np.empty((height, width, 3), dtype=np.float32)
-        radiance[ground.first_row :] = self._ground(view, ground, shadows, labels)
+        self._draw_ground(view, ground, shadows, radiance[ground.first_row :], labels)
         if last_row:
             background = draw_background(view, scene.light, scene.backdrop, last_row)
             radiance[: ground.first_row] = background[: ground.first_row]
@@ -293,12 +310,18 @@ class Renderer:
             radiance[rows] = background[rows] + clear * (radiance[rows] - background[rows])
         return radiance
 
-    def _ground(
-        self, view: View, ground: GroundField, shadows: Sequence[ShadowLayer], labels: NDArray[np.uint8]
-    ) -> Float32:
+    def _draw_ground(
+        self,
+        view: View,
+        ground: GroundField,
+        shadows: Sequence[ShadowLayer],
+        albedo: Float32,
+        labels: NDArray[np.uint8],
+    ) -> None:
+        """Write the ground's radiance to ``albedo`` (H', W, 3), which is its reflectance on the way there."""
         scene = self.scene
         bare = on_ground.tone(scene.ground, ground)
-        albedo = _float32(cv2.merge([bare * np.float32(c) for c in scene.ground.albedo_bgr]))
+        kernels.spread(bare, np.array(scene.ground.albedo_bgr, dtype=np.float32), albedo)
         self._paint.draw(view, ground, albedo, labels)
         sun = on_ground.sun_visibility(shadows, scene.shades, view, ground)
         wet = on_ground.wetness(scene.ground, ground)
@@ -310,7 +333,6 @@ class Renderer:
         height = max(light.sun_direction_map[2], 0.0)
         lights = np.array([[s * height for s in light.sun_bgr], light.sky_bgr, light.horizon_bgr], np.float32)
         kernels.light_ground(albedo, sun, wet, (ground.x_m, ground.y_m), centre, lights)
-        return albedo
 
 
 _CODE_STEPS = 16384  # number of levels of linear light that the table of sRGB codes tells apart
@@ -351,17 +373,20 @@ def expose(image: Float32, optics: Optics, rng: np.random.Generator) -> NDArray[
         image = _float32(cv2.GaussianBlur(image, (0, 0), optics.psf_sigma_px))
     height, width = image.shape[:2]
     gain = optics.mean_level / max(float(image[height // 3 :: 4, ::4].mean()), 1e-6)
-    balance = np.diag(gain * np.array(optics.white_balance_bgr)).astype(np.float32)
-    image = _float32(cv2.multiply(cv2.transform(image, balance), _vignette(height, width, optics.vignetting)))
+    balance = (gain * np.array(optics.white_balance_bgr)).astype(np.float32)
+    falloff = _vignette(height, width, optics.vignetting)
     if optics.grey:
-        image = np.repeat(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)[..., None], 3, axis=2)
+        grey = cv2.cvtColor(image * balance * falloff[..., None], cv2.COLOR_BGR2GRAY)
+        image = np.repeat(grey[..., None], 3, axis=2)
+        balance = np.ones_like(balance)
+        falloff = np.ones_like(falloff)
     out = np.empty(image.shape, dtype=np.uint8)
     row, column = (int(n) for n in rng.integers(0, _NOISE_SHIFT_PX, 2))
     field = _normal_field(height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX)
     noise = field[row : row + height, column : column + width]
     per_electron = np.float32(1.0 / optics.full_well_electrons)
     dark = np.float32(optics.read_noise**2)
-    kernels.record(image, noise, per_electron, dark, _srgb_codes(), out)
+    kernels.record(image, balance, falloff, noise, per_electron, dark, _srgb_codes(), out)
     return out
 
 
@@ -373,12 +398,13 @@ def _float32(array: NDArray[Any]) -> Float32:
 def _motion_blur(radiance: Float32, view: View, motion: Motion) -> Float32:
     """Mean of three images displaced along the image flow over the exposure, symmetric about its middle."""
     if motion.exposure_s <= 0:
-        return radiance.copy()
-    flow = _flow(view, motion) * np.float32(motion.exposure_s / 3.0)
-    if float(np.abs(flow).max()) < 0.02:
-        return radiance.copy()
+        return radiance
+    flow = _flow(view, motion)
+    share = np.float32(motion.exposure_s / 3.0)
+    if cv2.norm(flow, cv2.NORM_INF) * share < 0.02:
+        return radiance
     out = np.empty_like(radiance)
-    kernels.blur_along(radiance, flow, out)
+    kernels.blur_along(radiance, flow, share, out)
     return out
 
 
@@ -415,8 +441,7 @@ def _normal_field(height: int, width: int) -> Float32:
 @lru_cache(maxsize=4)
 def _vignette(height: int, width: int, loss: float) -> Float32:
     v, u = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
-    falloff = (1.0 - loss * 0.5 * (u * u + v * v)).astype(np.float32)
-    return np.ascontiguousarray(np.repeat(falloff[..., None], 3, axis=2))
+    return np.asarray(1.0 - loss * 0.5 * (u * u + v * v), dtype=np.float32)
 
 
 @cache
