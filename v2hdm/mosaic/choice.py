@@ -26,7 +26,7 @@ shown."""
 class Candidate(NamedTuple):
     """An image that shows tiles (T, 2) of (column, row), and how much it counts at the nodes of each."""
 
-    index: int
+    shot: int  # its number
     tiles: np.ndarray
     weight: np.ndarray  # (T, nodes)
     opacity: np.ndarray  # (T, nodes)
@@ -45,7 +45,7 @@ def chosen(candidates: Sequence[Candidate]) -> Views:
         is_blended[rows[_needed(weight[rows], opacity[rows])]] = True
     flags = np.split(is_blended, np.cumsum(counts)[:-1])
     return [
-        (candidate.index, candidate.tiles[is_needed])
+        (candidate.shot, candidate.tiles[is_needed])
         for candidate, is_needed in zip(candidates, flags, strict=True)
         if is_needed.any()
     ]

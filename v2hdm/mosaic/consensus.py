@@ -173,7 +173,7 @@ def _larger_than(size: int, flags: BoolArray) -> BoolArray:
 class _Patch(NamedTuple):
     """One tile in one image."""
 
-    index: int
+    shot: int  # its number
     grey: np.ndarray  # (TILE_PX, TILE_PX) float32
     density: np.ndarray  # (blocks, blocks) px of the image a cell; 0 where not all of it is trusted
 
@@ -212,7 +212,7 @@ class _Comparison:
         compared = []
         for (column, row), of_tile in patches.items():
             kinds, shows = _compare(of_tile, self._directions(of_tile, map_from_sheet, column, row))
-            indices = [patch.index for patch in of_tile]
+            indices = [patch.shot for patch in of_tile]
             place = (first_row + row * _BLOCKS, first_column + column * _BLOCKS)
             compared.append(_Tile(*place, kinds, indices, shows))
         return compared
@@ -242,7 +242,7 @@ class _Comparison:
         at = (np.arange(_BLOCKS) + 0.5) * BLOCK_PX - 0.5
         centres_px = np.stack(np.meshgrid(at + column * TILE_PX, at + row * TILE_PX), axis=-1)
         centres_map = apply_homography(map_from_sheet, centres_px)
-        cameras_map = np.array([self._shots[patch.index].centre_map for patch in patches], dtype=np.float64)
+        cameras_map = np.array([self._shots[patch.shot].centre_map for patch in patches], dtype=np.float64)
         return (centres_map[:, :, None] - cameras_map[:, :2]) / cameras_map[:, 2:]
 
 

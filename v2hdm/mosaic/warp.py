@@ -256,7 +256,7 @@ class Warp:
 
     def between(self, values: np.ndarray) -> np.ndarray:
         """Values (..., side, side) of nodes at the pixels (..., TILE_PX, TILE_PX) of their tiles, float32."""
-        return self._from_nodes @ (values.astype(np.float32) @ self._from_nodes.T)
+        return np.asarray(self._from_nodes @ (values.astype(np.float32) @ self._from_nodes.T))
 
     def pixels(self, nodes: Nodes) -> Pixels:
         """Where the pixels of the tiles lie.
