@@ -141,6 +141,11 @@ def test_what_goes_with_the_map_is_of_the_whole_drive(scene, result, whole):
     assert {lane.kind for lane in result.hd_map.lanes} == {lane.kind for lane in whole.hd_map.lanes}
 
 
+def test_what_several_sections_see_counts_once(result, whole):
+    for count in ("observations", "candidates"):
+        assert result.diagnostics[count] == whole.diagnostics[count]
+
+
 def test_a_section_without_a_marking_is_named_in_one_line(scene, tmp_path):
     first = sections_of(scene.drive, 65.0)[0].images
     bare = [

@@ -117,14 +117,18 @@ def map_in_sections(
     proposals: list[Proposal] = run.finish(solved, solved.work.propose)
     heard = _classified(run, solved, proposals, options.acceptance)
     clock_root = _clock_root(run, solved, [proposal.clock_slopes for proposal in proposals], drive)
+    candidate_count = sum(len(proposal.kinds) for proposal in proposals)
     del proposals
     finished: list[Finished] = run.finish(solved, replace(solved.work, clock_root=clock_root).finish)
     result = merged([section.result for section in finished], drive, own_images)
     assert result.evidence is not None
     lanes = lanes_along(join_paths([path for section in finished for path in section.lanes]), options.lanes)
+    # Of what several sections see each counts once.
+    counts = {"observations": float(solved.observation_count), "candidates": float(candidate_count)}
     result = replace(
         result,
         hd_map=replace(result.hd_map, lanes=lanes),
+        diagnostics={**result.diagnostics, **counts},
         evidence=replace(result.evidence, score_tests=tests, held_out=solved.held_out),
         heard=heard,
     )
@@ -166,6 +170,11 @@ class _Solved(NamedTuple):
     joint: Joint
     shape: Shape
     held_out: dict[str, float]  # losses by pose model
+
+    @property
+    def observation_count(self) -> int:
+        """The number of observations that the solve was made from."""
+        return sum(len(fit.corner) for fit in self.joint.results)
 
 
 def _joint_solve(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone]) -> _Solved:
