@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from v2hdm.association.groups import FusedGroups
+from v2hdm.io.maps.corrections import ACCEPTED, Correction
 from v2hdm.records import LANE_DASH
 from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
 from v2hdm.site.hypotheses import Kind
@@ -510,6 +511,27 @@ def test_a_candidate_that_lost_all_corners_lies_where_it_was_seen():
     unseen = np.full((1, 4, 2), np.nan)
     candidates = Candidates.seen(unseen, np.full((1, 8, 8), np.nan), np.array([[30.0, 4.0]]))
     np.testing.assert_array_equal(candidates.corners_map, np.broadcast_to([30.0, 4.0], (1, 4, 2)))
+
+
+def test_what_was_never_seen_twice_has_no_place_to_be_missed_at_or_corrected():
+    _, candidates = row(24, [DIAMOND] * 20)
+    candidates = without(candidates, 5, [0, 1, 2, 3])
+    counts = well_seen(20)
+    for never_observed in (counts.images, counts.observations, counts.agreeing):
+        never_observed[5] = 0
+    places = []
+
+    def counted(corners_map):
+        places.append(corners_map)
+        return counts
+
+    at_origin = Correction(says=ACCEPTED, kind="diamond", outline_map=DIAMOND.tolist())
+    on_ground = Parallax(np.ones((20, 1)), np.full((20, 1, 1), 1e-4), np.full(20, 9.0))
+    options = AcceptanceOptions(corrections=[at_origin])
+    classified = classify(candidates, np.zeros(20, dtype=np.int64), ("diamond",), counted, on_ground, options)
+    for corners_map in places:
+        assert np.flatnonzero(np.isnan(corners_map).any(axis=(1, 2))).tolist() == [5]
+    assert classified.verdict[5] == "a corner was never seen twice"
 
 
 def test_what_looks_unlike_its_class_and_has_another_shape_is_a_letter_and_a_worn_marking_is_none():

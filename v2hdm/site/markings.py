@@ -120,10 +120,14 @@ def classify(
     """
     known_corners = np.where(solved.known[..., None], solved.corners_map, np.nan)
     standard_m = {index: STANDARD_M[name] for index, name in enumerate(kinds) if name in STANDARD_M}
-    uncorrected = posterior(solved, kind, counted(known_corners), None, standard_m)
+    known_counts = counted(known_corners)
+    uncorrected = posterior(solved, kind, known_counts, None, standard_m)
+    # What was never seen twice has no place. Left at the origin, it would be missed by all images there.
+    is_placed = known_counts.observations > 0
+    placed_map = np.where(is_placed[:, None, None], uncorrected.candidates.corners_map, np.nan)
     names = [kinds[index] for index in kind]
     number = kind.copy()
-    stated = Stated.of(options.corrections, uncorrected.candidates.corners_map, names)
+    stated = Stated.of(options.corrections, placed_map, names)
     index_of_name = {kinds[index]: index for index in np.unique(kind).tolist()}
     for group, correction in stated.confirmed.items():
         names[group] = correction.stated_kind or names[group]
@@ -131,7 +135,7 @@ def classify(
         number[group] = index_of_name.get(names[group], number[group])
     solved = stated.placed(solved, uncorrected.candidates)
     # With the class's shape, a missing corner has a place where it should have been visible.
-    counts = counted(uncorrected.candidates.corners_map)
+    counts = counted(placed_map)
     standing_odds = None
     if standing is not None:
         standing_odds = standing(solved.corners_map, _known_ends(solved, uncorrected))
