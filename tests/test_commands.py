@@ -51,7 +51,7 @@ NEEDED = {
     "v2hdm simulate +run=port2": ("map", "omegaconf", "omegaconf"),
     "v2hdm check drive": ("map", "cv2", "matplotlib"),
     "v2hdm calibrate points points.csv --intrinsics a.yaml": ("map", "torch", "kornia"),
-    "v2hdm mosaic outputs/port2": ("map", "torch", "kornia"),
+    "v2hdm mosaic outputs/port2": ("map", "cv2", "jinja2"),
     "v2hdm report results": ("map", "cv2", "jinja2"),
     "v2hdm fleet drive.yaml": ("map", "omegaconf", "omegaconf"),
     "v2hdm detect images": ("", "cv2", ""),

@@ -102,9 +102,9 @@ def test_a_marking_that_something_hides_in_one_image_is_no_label_there(
         pair: (before[pair], crowd_of.get(pair)) for pair in others if crowd_of.get(pair) != before[pair]
     }
     # The usual contrast of the marking itself is another without that image.
-    of_others = {states for (_, marking), states in changed.items() if marking != key[1]}
-    assert of_others <= {(0, 1)}, "one that is hidden makes others less sure, and none surer"
-    assert len(changed) < 0.05 * len(others)
+    of_others = [states for (_, marking), states in changed.items() if marking != key[1]]
+    assert set(of_others) <= {(0, 1)}, "one that is hidden makes others less sure, and none surer"
+    assert len(of_others) < 0.03 * len(others)
 
 
 def test_the_training_reads_them_and_takes_nothing_unsure_for_a_marking(labelled, small_drive):

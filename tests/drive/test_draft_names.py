@@ -48,7 +48,7 @@ def test_a_link_to_a_file_that_is_gone_is_not_replaced(tmp_path):
 
 def test_settings_of_another_camera_are_named(tmp_path):
     settings = ["cameras.fornt.camera_info=a.yaml", "poses=p.tum"]
-    with pytest.raises(DriveError, match=r"--set cameras\.fornt\.camera_info: not used, .* name front"):
+    with pytest.raises(DriveError, match=r"--set cameras\.fornt\.camera_info: not used: .*; name front"):
         draft_drive(images(tmp_path / "front", "1.0"), tmp_path / "drive", settings)
 
 

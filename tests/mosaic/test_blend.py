@@ -13,6 +13,7 @@ from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.mosaic import blend, warp
 from v2hdm.mosaic.blend import whole
+from v2hdm.mosaic.consensus import Consensus
 from v2hdm.mosaic.views import FEATHER, REACH_M, Canvas, Shot, adjusted_shots, lens_of, recorded_shots
 from v2hdm.records import Calibration
 
@@ -137,6 +138,12 @@ def test_a_sloping_road_is_undone_and_clocks_are_kept(drive):
     for k in range(len(flat) - 1):
         np.testing.assert_allclose(same[k].pinhole_px_from_map, flat[k].pinhole_px_from_map, atol=1e-6)
         np.testing.assert_allclose(later[k].pinhole_px_from_map, flat[k + 1].pinhole_px_from_map, atol=1e-6)
+
+
+def test_where_no_image_shows_the_ground_nothing_is_shown(drive):
+    canvas = Canvas(np.array([6.5, 2.5]), 0.02, 220, 240)
+    nowhere = Consensus(canvas, np.zeros((1, 1), dtype=np.uint8), {})
+    assert not whole(canvas, recorded_shots(drive), lenses(drive), nowhere).any()
 
 
 def test_an_image_of_another_size_is_named(drive, tmp_path):

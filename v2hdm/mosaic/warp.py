@@ -171,13 +171,13 @@ class Sources:
 
         The last used stay decoded.
         """
-        ordered = [self._shots[index] for index in order]
+        shots = [self._shots[index] for index in order]
         with ThreadPoolExecutor(1) as decoder:
-            ahead = [decoder.submit(self._decoded, shot.path, shot.camera) for shot in ordered[:1]]
-            for following in [*ordered[1:], None]:
+            ahead = [decoder.submit(self._decoded, shot.path, shot.camera) for shot in shots[:1]]
+            for number in range(len(shots)):
                 pixels = ahead.pop().result()
-                if following is not None:
-                    ahead.append(decoder.submit(self._decoded, following.path, following.camera))
+                for shot in shots[number + 1 : number + 2]:
+                    ahead.append(decoder.submit(self._decoded, shot.path, shot.camera))
                 yield pixels
 
 
