@@ -1,5 +1,6 @@
 """The report in a browser: it draws, answers the pointer, and asks for nothing beyond itself."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,20 @@ PAINTED = """() => [...document.querySelectorAll("#map canvas")].map((canvas) =>
     for (let n = 3; n < data.length; n += 4) painted += data[n] > 0;
     return painted;
 }).reduce((sum, painted) => sum + painted, 0)"""
+
+
+LONGEST_S = 30.0
+
+
+def wait_until_painted(page, least):
+    """Wait until the map shows more than ``least`` pixels.
+
+    Playwright's own wait evaluates text from its second look on, which the page's security policy forbids.
+    """
+    end_s = time.monotonic() + LONGEST_S
+    while page.evaluate(PAINTED) <= least:
+        assert time.monotonic() < end_s
+        page.wait_for_timeout(20)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +73,7 @@ def is_quiet(watched):
 def test_the_map_is_drawn_and_fits_its_window(browser, report, width, height, scheme):
     with opened(browser, report, width, height, scheme) as watched:
         page = watched.page
-        page.wait_for_function(f"({PAINTED})() > 300")  # the map is drawn a frame after the page has loaded
+        wait_until_painted(page, 300)  # the map is drawn a frame after the page has loaded
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert (paper == "rgb(255, 255, 255)") == (scheme == "light")
@@ -90,7 +105,7 @@ def test_every_layer_changes_the_picture_when_it_is_switched(browser, report):
                 boxes.nth(number).check()
         page.wait_for_timeout(100)
         for number in range(boxes.count()):
-            page.wait_for_function(f"({PAINTED})() > 0")
+            wait_until_painted(page, 0)
             before = page.evaluate(PAINTED)
             boxes.nth(number).uncheck()
             page.wait_for_timeout(100)
@@ -240,7 +255,7 @@ def test_a_word_is_labelled_found_and_searched_by_what_it_says_or_may_say(browse
         assert page.locator("#details h3").inner_text() == "Symbol 70, text \u201cEBH\u201d"
         assert "EBH, with probability 0.90" in page.locator("#details").inner_text()
         assert NASTY in page.locator("#details").inner_text()
-        page.wait_for_function("document.querySelectorAll('.leaflet-tooltip.corner').length > 0")
+        page.locator(".leaflet-tooltip.corner").first.wait_for()
         assert "EBH" in page.locator(".leaflet-tooltip.corner").all_inner_texts()
         page.fill("#search", "ebh")
         assert page.locator("#list tbody th").all_inner_texts() == ["70"]
@@ -273,7 +288,7 @@ def test_a_site_seen_from_afar_is_dots_that_are_named_and_selected(browser, larg
     with opened(browser, large) as watched:
         page = watched.page
         page.locator("#map").scroll_into_view_if_needed()
-        page.wait_for_function(f"({PAINTED})() > {THOUSANDS}")
+        wait_until_painted(page, THOUSANDS)
         place = page.evaluate(
             """() => {
                 const { map, things } = window.v2hdmMap;
@@ -299,6 +314,6 @@ def test_a_panned_map_is_drawn_where_it_was_not_before(browser, large):
         page.evaluate("window.v2hdmMap.map.setView([20, 20], 5, { animate: false })")
         for _ in range(4):
             page.evaluate("window.v2hdmMap.map.panBy([600, 0], { animate: false })")
-        page.wait_for_function(f"({PAINTED})() > 5000")
+        wait_until_painted(page, 5000)
         assert "drawn" in page.locator("#map").get_attribute("data-detail")
         is_quiet(watched)
