@@ -59,15 +59,20 @@ def measured(folder, port, earlier=None):
     return hd_map, {m.id: share_rendered(paints[k]) for m, k in zip(markings, nearest, strict=True)}
 
 
-def test_the_share_of_paint_left_is_within_five_hundredths_of_what_was_rendered(short_drive):
-    hd_map, true_share = measured(short_drive, short_port())
-    measured_shares = [
+def shares(hd_map, true_share):
+    """Measured shares of paint, their sigmas and the true shares (3, N) of the markings that have one."""
+    rows = [
         (marking.paint.share, marking.paint.sigma, true_share[marking.id])
         for marking in hd_map.markings
         if marking.paint
     ]
-    share, sigma, true = np.array(measured_shares).T
-    assert len(measured_shares) > 20
+    return np.array(rows).T
+
+
+def test_the_share_of_paint_left_is_within_five_hundredths_of_what_was_rendered(short_drive):
+    hd_map, true_share = measured(short_drive, short_port())
+    share, sigma, true = shares(hd_map, true_share)
+    assert len(share) > 20
     assert true.min() < 0.4  # some are nearly gone
     assert np.abs(share - true).mean() <= 0.05
     assert np.mean(np.abs(share - true) <= 2 * sigma) >= 0.85
@@ -78,13 +83,8 @@ def test_shadows_and_vehicles_of_a_port_that_nothing_was_tuned_on_are_no_wear(re
     route = RouteConfig(pieces=TINY_ROUTE, image_spacing_m=2.0)
     port = replace(short_port(), seed=10, route=route)
     hd_map, true_share = measured(rendered(port), port)
-    measured_shares = [
-        (marking.paint.share, marking.paint.sigma, true_share[marking.id])
-        for marking in hd_map.markings
-        if marking.paint
-    ]
-    share, sigma, true = np.array(measured_shares).T
-    assert len(measured_shares) > 10
+    share, sigma, true = shares(hd_map, true_share)
+    assert len(share) > 10
     assert np.abs(share - true).mean() <= 0.06
     assert np.mean(np.abs(share - true) <= 2 * sigma) >= 0.95
 

@@ -158,7 +158,7 @@ class Covariance:
 
     @cached_property
     def _roots(self) -> _Roots | None:
-        """What is kept of solved right-hand sides; None where there is too much of it."""
+        """The solved right-hand sides that are kept; None where they would take too much memory."""
         size = self.whitening.reduced_factor.size
         count = self.whitening.engine.arrays.corner_count
         if 2 * count * size > _NUMBERS_KEPT:

@@ -12,13 +12,12 @@ observations: 2**29 and 2**30 save no more."""
 # Sizes, bytes, from which an array has pages of its own; glibc before 2.35 refuses the first.
 _POOLED_BYTES = (2**28, 2**25)
 
-# Parameters of glibc's mallopt (malloc.h).
-_TRIM_THRESHOLD = -1
-_MMAP_THRESHOLD = -3
+_TRIM_THRESHOLD = -1  # parameter M_TRIM_THRESHOLD of glibc's mallopt (malloc.h)
+_MMAP_THRESHOLD = -3  # parameter M_MMAP_THRESHOLD of the same
 
 
 def keep_freed_memory() -> None:
-    """Have this process keep what it frees; elsewhere than on glibc nothing happens.
+    """Have this process keep the memory that it frees; without glibc nothing happens.
 
     By itself glibc hands large arrays back, and the system clears the pages of the next one: an eighth of the
     time of a solve.
@@ -28,4 +27,6 @@ def keep_freed_memory() -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
-        any(mallopt(_MMAP_THRESHOLD, size) for size in _POOLED_BYTES)
+        for size_bytes in _POOLED_BYTES:
+            if mallopt(_MMAP_THRESHOLD, size_bytes):
+                break

@@ -125,7 +125,7 @@ class _Blend:
     def _contribution(
         self, index: int, tiles: np.ndarray, pixels: np.ndarray, warp: Warp
     ) -> list[np.ndarray]:
-        """What an image adds to the five sums of tiles (T, 2): each (T, pixels)."""
+        """The five addends (T, pixels) of an image to the sums of tiles (T, 2)."""
         shot = self._shots[index]
         lens = self._lenses[shot.camera]
         where = warp.pixels(warp.nodes(shot, lens, tiles))

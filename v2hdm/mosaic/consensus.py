@@ -179,7 +179,7 @@ class _Patch(NamedTuple):
 
 
 class _Tile(NamedTuple):
-    """What is told of a tile, its first block at (``row``, ``column``)."""
+    """The kinds of a tile's blocks, the first at (``row``, ``column``), and who shows each."""
 
     row: int
     column: int

@@ -33,7 +33,7 @@ class _Solved(NamedTuple):
     end: int
     is_used: Tensor  # (D,) reduced variables where a column is not zero: often few
     reduced: Tensor  # the columns there (U, 2 n)
-    own: Tensor  # (2 n, 2 n) of the corners' own variables
+    unshared: Tensor  # the columns (2 n, 2 n) at the corners' variables
     regression: Tensor  # (b, 2 n) inner products with the columns of the part's border
     gained: Tensor  # (b, 2 n) what the border gained by the join, times these
 
@@ -43,7 +43,7 @@ class _Solved(NamedTuple):
         out = self.reduced[in_both[self.is_used]].mT @ other.reduced[in_both[other.is_used]]
         out += self.regression.mT @ other.gained
         if other is self:
-            out += self.own.mT @ self.own
+            out += self.unshared.mT @ self.unshared
         by_corner = out.view(self.end - self.begin, 2, other.end - other.begin, 2)
         return np.asarray(by_corner.cpu().numpy())
 
@@ -163,18 +163,18 @@ class JoinedCovariance(Covariance):
         """Covariances (P, 2, 2) of pairs of corners (n,), ascending, at their ascending places (2, P)."""
         early, late = places
         blocks = np.empty((len(early), 2, 2))
-        kept: list[_Solved] = []
+        waited_for: list[_Solved] = []
         for begin, end in chunks_of(self.whitening, corners):
             solved = self._solved(corners[begin:end], begin)
-            kept.append(solved)
+            waited_for.append(solved)
             is_late = (late >= begin) & (late < end)
-            for before in kept:
+            for before in waited_for:
                 rows = np.flatnonzero(is_late & (early >= before.begin) & (early < before.end))
                 if len(rows):
                     covariance = before.covariance(solved)
                     blocks[rows] = covariance[early[rows] - before.begin, :, late[rows] - begin]
             waiting = early[late >= end]
-            kept = [before for before in kept if (waiting < before.end).any()]
+            waited_for = [before for before in waited_for if (waiting < before.end).any()]
         return blocks
 
     def _solved(self, corners: Tensor, begin: int) -> _Solved:
@@ -187,7 +187,7 @@ class JoinedCovariance(Covariance):
             end=begin + len(corners),
             is_used=is_used,
             reduced=columns.reduced[is_used],
-            own=columns.own,
+            unshared=columns.own,
             regression=regression,
             gained=self._gained @ regression,
         )

@@ -13,9 +13,8 @@ from v2hdm.mapping.conclusion import FinalSolve
 from v2hdm.records import BoolArray, IntArray
 from v2hdm.site.relative import FARTHEST_M
 
-_MOVED_M = (
-    3.0  # most that the centre of a candidate moves, m, where its class places an unseen corner; chosen
-)
+_MOVED_M = 3.0
+"""Longest way of a candidate's centre, m, when its class places an unseen corner; chosen."""
 
 
 class Pairs(NamedTuple):
