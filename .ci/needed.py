@@ -14,14 +14,15 @@ _OWN_EXTRAS = re.compile(rf"{PROJECT['name']}\[([a-z,]+)\]")
 
 def needed(extra: str) -> list[str]:
     """The requirements of the base install and of an extra, with those of the extras that it names."""
-    lines = dict.fromkeys(PROJECT["dependencies"])
+    requirements = dict.fromkeys(PROJECT["dependencies"])
     for line in PROJECT["optional-dependencies"][extra]:
         named = _OWN_EXTRAS.fullmatch(line)
-        for more in (
-            [line] if named is None else [line for name in named[1].split(",") for line in needed(name)]
-        ):
-            lines[more] = None
-    return [*lines]
+        if named is None:
+            requirements[line] = None
+            continue
+        for name in named[1].split(","):
+            requirements |= dict.fromkeys(needed(name))
+    return [*requirements]
 
 
 if __name__ == "__main__":
