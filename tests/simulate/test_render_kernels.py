@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numba.core.errors import TypingError
+from scipy.ndimage import map_coordinates
 
 from v2hdm.simulate.render import kernels
 from v2hdm.simulate.render.scene import noise_tile, sample, scale_of
@@ -52,6 +53,27 @@ def test_the_sky_fades_upwards_and_ends_at_the_skyline(planes):
     expected = above + covered * (wall * skyline[1][block][..., None] - above)
     assert np.allclose(picture, expected, atol=1e-4)
     assert 0.1 < covered.mean() < 0.9
+
+
+@pytest.mark.parametrize("reach_px", [0.4, 3.0, 90.0])
+def test_a_moved_image_is_interpolated_within_itself_and_at_its_borders(reach_px):
+    rng = np.random.default_rng(9)
+    image = rng.uniform(0, 1, (37, 61, 3)).astype(np.float32)
+    rows, columns = np.mgrid[:37, :61]
+    flow = (reach_px * np.stack([np.sin(columns / 20), rows / 36], axis=-1)).astype(np.float32)
+    mean = np.empty_like(image)
+    moved = np.empty((4, 61), dtype=np.int32)
+    kernels.blur_along(
+        image.reshape(37, -1), flow.reshape(37, -1), np.float32(1), moved, mean.reshape(37, -1)
+    )
+
+    for channel in range(3):
+        plane = image[..., channel]
+        ahead, back = (
+            map_coordinates(plane, [rows + step[..., 1], columns + step[..., 0]], order=1, mode="nearest")
+            for step in (flow, -flow)
+        )
+        assert np.allclose(mean[..., channel], (plane + ahead + back) / 3, atol=1e-4)
 
 
 def test_a_plane_that_is_no_block_of_memory_is_refused(planes):

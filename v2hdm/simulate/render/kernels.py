@@ -44,11 +44,22 @@ _fma: Any = intrinsic(_rounded_once)  # a b + c rounded once, as in cv2.remap
 
 
 def _place(context: Any, builder: Any, kind: Any, plane: Any, row: Any, column: Any) -> Any:
-    """The address of a pixel of a plane (H, W), by numbers of 32 bits: processors gather by those fastest."""
+    """The address of a pixel of a plane (H, W); by numbers of 32 bits processors gather fastest.
+
+    Of those of 64 bits LLVM sees which lie side by side.
+    """
     array = _numba_arrays.make_array(kind)(context, builder, plane)
-    width = builder.trunc(_numba_code.unpack_tuple(builder, array.shape, 2)[1], row.type)
+    width = _numba_code.unpack_tuple(builder, array.shape, 2)[1]
+    if row.type.width == 64:
+        return builder.gep(array.data, [builder.add(builder.mul(row, width), column)])
+    width = builder.trunc(width, row.type)
     flat = builder.add(builder.mul(row, width, flags=["nsw"]), column, flags=["nsw"])
     return builder.gep(array.data, [builder.sext(flat, cgutils.intp_t)])
+
+
+def _number(row: Any, column: Any) -> Any:
+    """The type of numbers of rows and columns: 32 bits where both have them."""
+    return types.int32 if row == column == types.int32 else types.int64
 
 
 def _what_is_read(builder: Any) -> Any:
@@ -67,7 +78,8 @@ def _marked_read(_: Any, plane: Any, row: Any, column: Any) -> Any:
         value.set_metadata("alias.scope", _what_is_read(builder))
         return value
 
-    return types.float32(plane, types.int32, types.int32), build
+    number = _number(row, column)
+    return types.float32(plane, number, number), build
 
 
 def _marked_write(_: Any, plane: Any, row: Any, column: Any, value: Any) -> Any:
@@ -76,11 +88,13 @@ def _marked_write(_: Any, plane: Any, row: Any, column: Any, value: Any) -> Any:
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         *place, number = arguments
+        number = context.get_value_as_data(builder, signature.args[3], number)
         stored = builder.store(number, _place(context, builder, signature.args[0], *place))
         stored.set_metadata("noalias", _what_is_read(builder))
         return context.get_dummy_value()
 
-    return types.none(plane, types.int32, types.int32, types.float32), build
+    number = _number(row, column)
+    return types.none(plane, number, number, plane.dtype), build
 
 
 # Reads of planes to which no ``_write`` of their kernel writes. LLVM cannot know that of a texture, whose
@@ -415,53 +429,143 @@ def light_ground(
 
 
 @exactly_inlined
-def _at_border(place: int, size: int) -> int:
-    return min(max(place, 0), size - 1)
+def _at_border(place: int, last: int) -> int:
+    return min(max(place, 0), last)
+
+
+@exactly_inlined
+def _between(image: Any, places: Any, channel: Any, share_x: Any, share_y: Any) -> Any:
+    """A channel's value between four pixels, as cv2.remap has it."""
+    top, bottom, left, right = places
+    left = left + channel
+    right = right + channel
+    upper = _read(image, top, left)
+    lower = _read(image, bottom, left)
+    above = _fma(share_x, _read(image, top, right) - upper, upper)
+    below = _fma(share_x, _read(image, bottom, right) - lower, lower)
+    return _fma(share_y, below - above, above)
+
+
+@exactly_inlined
+def _between_pixels(image: Any, places: Any, x: Any, y: Any) -> Any:
+    """Blue, green and red at a place of an image between four pixels of it."""
+    share_x = x - _f(np.floor(x))
+    share_y = y - _f(np.floor(y))
+    blue = _between(image, places, 0, share_x, share_y)
+    green = _between(image, places, 1, share_x, share_y)
+    return blue, green, _between(image, places, 2, share_x, share_y)
+
+
+@exactly_inlined
+def _mean_of_three(
+    image: Any, flow: Any, share: Any, row: Any, column: Any, back: Any, ahead: Any, out: Any
+) -> None:
+    """Write a pixel of :func:`blur_along`, between the four pixels ``back`` and the four ``ahead`` of it."""
+    along_x = _read(flow, row, 2 * column) * share
+    along_y = _read(flow, row, 2 * column + 1) * share
+    x = _f(column)
+    y = _f(row)
+    blue, green, red = _between_pixels(image, back, x - along_x, y - along_y)
+    blue_ahead, green_ahead, red_ahead = _between_pixels(image, ahead, x + along_x, y + along_y)
+    first = 3 * column
+    third = _f(1.0 / 3.0)
+    _write(out, row, first, (_read(image, row, first) + blue + blue_ahead) * third)
+    _write(out, row, first + 1, (_read(image, row, first + 1) + green + green_ahead) * third)
+    _write(out, row, first + 2, (_read(image, row, first + 2) + red + red_ahead) * third)
+
+
+@exactly_inlined
+def _places(rows: Any, column: Any, last: Any) -> Any:
+    """The rows and first numbers of the four pixels around a place of an image."""
+    return rows[0], rows[1], 3 * _at_border(column, last), 3 * _at_border(column + 1, last)
 
 
 @exact_kernel
-def blur_along(image: _Plane, flow: _Plane, share: Any, out: _Plane) -> None:
-    """Write the mean (H, W, 3) of an image and of it moved by a share of the flow (H, W, 2) px either way."""
-    height = image.shape[0]
-    width = image.shape[1]
-    for row in range(height):
+def blur_along(image: _Plane, flow: _Plane, share: Any, moved: NDArray[np.int32], out: _Plane) -> None:
+    """Write the mean (H, 3 W) of an image and of it moved by a share of the flow (H, 2 W) px either way.
+
+    Pixels that move to neighbouring ones are done together. ``moved`` (4, W) is written to: to which columns
+    from its own, and to which rows, a row's pixels move back and ahead.
+    """
+    width = image.shape[1] // 3
+    last = width - 1
+    last_row = image.shape[0] - 1
+    for row in range(image.shape[0]):
         for column in range(width):
-            for c in range(3):
-                out[row, column, c] = image[row, column, c]
-            for sign in (_f(-1.0), _ONE):
-                x = _f(column) + sign * (flow[row, column, 0] * share)
-                y = _f(row) + sign * (flow[row, column, 1] * share)
-                floor_x = _f(np.floor(x))
-                floor_y = _f(np.floor(y))
-                share_x = x - floor_x
-                share_y = y - floor_y
-                left = _at_border(int(floor_x), width)
-                right = _at_border(int(floor_x) + 1, width)
-                top = _at_border(int(floor_y), height)
-                bottom = _at_border(int(floor_y) + 1, height)
-                for c in range(3):
-                    above = _fma(share_x, image[top, right, c] - image[top, left, c], image[top, left, c])
-                    first = image[bottom, left, c]
-                    below = _fma(share_x, image[bottom, right, c] - first, first)
-                    out[row, column, c] += _fma(share_y, below - above, above)
-            for c in range(3):
-                out[row, column, c] *= _f(1.0 / 3.0)
+            along_x = _read(flow, row, 2 * column) * share
+            along_y = _read(flow, row, 2 * column + 1) * share
+            _write(moved, 0, column, int(np.floor(_f(column) - along_x)) - column)
+            _write(moved, 1, column, int(np.floor(_f(column) + along_x)) - column)
+            _write(moved, 2, column, int(np.floor(_f(row) - along_y)))
+            _write(moved, 3, column, int(np.floor(_f(row) + along_y)))
+        begin = 0
+        while begin < width:
+            back = moved[0, begin]
+            ahead = moved[1, begin]
+            upper = moved[2, begin]
+            lower = moved[3, begin]
+            end = begin + 1
+            while (
+                end < width
+                and moved[0, end] == back
+                and moved[1, end] == ahead
+                and moved[2, end] == upper
+                and moved[3, end] == lower
+            ):
+                end += 1
+            behind = (_at_border(upper, last_row), _at_border(upper + 1, last_row))
+            before = (_at_border(lower, last_row), _at_border(lower + 1, last_row))
+            inner = min(max(begin, -min(back, ahead)), end)
+            outer = max(min(end, last - max(back, ahead)), inner)
+            for column in range(inner, outer):
+                left = 3 * (column + back)
+                right = 3 * (column + ahead)
+                _mean_of_three(
+                    image, flow, share, row, column,
+                    (behind[0], behind[1], left, left + 3), (before[0], before[1], right, right + 3), out,
+                )  # fmt: skip
+            for low, high in ((begin, inner), (outer, end)):
+                for column in range(low, high):
+                    _mean_of_three(
+                        image, flow, share, row, column,
+                        _places(behind, column + back, last), _places(before, column + ahead, last), out,
+                    )  # fmt: skip
+            begin = end
+
+
+@exactly_inlined
+def _expose(
+    image: Any, noise: Any, row: Any, place: Any, gain: Any, falloff: Any, sensor: Any, levels: Any
+) -> None:
+    """Write the level of a number of an image's row, in steps of ``sensor``."""
+    field, shift_row, shift_column = noise
+    per_electron, dark, steps = sensor
+    level = _read(image, row, place) * gain * falloff
+    sigma = _f(np.sqrt(max(level, _ZERO) * per_electron + dark))
+    level = (level + sigma * _read(field, row + shift_row, place + 3 * shift_column)) * steps
+    _write(levels, 0, place, int(_clip(level, _ZERO, steps)))
 
 
 @exact_kernel
 def record(
-    image: _Plane, gain: _Plane, falloff: _Plane, noise: _Plane, per_electron: Any, dark: Any,
-    codes: NDArray[np.uint8], out: NDArray[np.uint8],
+    image: _Plane, gain: _Plane, falloff: _Plane, noise: Any, per_electron: Any, dark: Any,
+    codes: NDArray[np.uint8], levels: NDArray[np.int32], out: NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    """Write the codes (H, W, 3) of an image with shot noise and noise in the dark.
+    """Write the codes (H, 3 W) of an image with shot noise and noise in the dark.
 
-    It is exposed by a ``gain`` (3,) and the lens's ``falloff`` (H, W).
+    It is exposed by a ``gain`` (3,) and the lens's ``falloff`` (H, W). ``noise`` is a field of normal
+    numbers with the row and column of the first pixel's. ``levels`` (1, 3 W) is written to.
     """
-    steps = _f(len(codes) - 1)
+    sensor = (per_electron, dark, _f(len(codes) - 1))
+    blue = gain[0]
+    green = gain[1]
+    red = gain[2]
     for row in range(image.shape[0]):
-        for column in range(image.shape[1]):
-            for c in range(3):
-                level = image[row, column, c] * gain[c] * falloff[row, column]
-                sigma = _f(np.sqrt(max(level, _ZERO) * per_electron + dark))
-                level = (level + sigma * noise[row, column, c]) * steps
-                out[row, column, c] = codes[int(_clip(level, _ZERO, steps))]
+        # Apart from looking up the codes: one load at a time, it would keep LLVM from taking many at once.
+        for column in range(falloff.shape[1]):
+            lost = _read(falloff, row, column)
+            _expose(image, noise, row, 3 * column, blue, lost, sensor, levels)
+            _expose(image, noise, row, 3 * column + 1, green, lost, sensor, levels)
+            _expose(image, noise, row, 3 * column + 2, red, lost, sensor, levels)
+        for place in range(image.shape[1]):
+            out[row, place] = codes[levels[0, place]]

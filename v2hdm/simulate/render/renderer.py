@@ -383,10 +383,13 @@ def expose(image: Float32, optics: Optics, rng: np.random.Generator) -> NDArray[
     out = np.empty(image.shape, dtype=np.uint8)
     row, column = (int(n) for n in rng.integers(0, _NOISE_SHIFT_PX, 2))
     field = _normal_field(height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX)
-    noise = field[row : row + height, column : column + width]
+    levels = np.empty((1, 3 * width), dtype=np.int32)
     per_electron = np.float32(1.0 / optics.full_well_electrons)
     dark = np.float32(optics.read_noise**2)
-    kernels.record(image, balance, falloff, noise, per_electron, dark, _srgb_codes(), out)
+    noise = (_rows(field), row, column)
+    kernels.record(
+        _rows(image), balance, falloff, noise, per_electron, dark, _srgb_codes(), levels, _rows(out)
+    )
     return out
 
 
@@ -404,8 +407,14 @@ def _motion_blur(radiance: Float32, view: View, motion: Motion) -> Float32:
     if cv2.norm(flow, cv2.NORM_INF) * share < 0.02:
         return radiance
     out = np.empty_like(radiance)
-    kernels.blur_along(radiance, flow, share, out)
+    moved = np.empty((4, flow.shape[1]), dtype=np.int32)
+    kernels.blur_along(_rows(radiance), _rows(flow), share, moved, _rows(out))
     return out
+
+
+def _rows(image: NDArray[Any]) -> NDArray[Any]:
+    """An image (H, W, channels) as a plane (H, channels W)."""
+    return image.reshape(len(image), -1)
 
 
 def _flow(view: View, motion: Motion) -> Float32:
