@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from v2hdm.association.ground import ground_points, ground_points_with_jacobian
@@ -330,11 +331,7 @@ class Nodes:
 
 def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
     """Nodes on the ridges of ``cloud`` in at least ``least_images``, about :data:`NODE_SPACING_M` apart."""
-    # One seed per cell of position and direction.
-    angle = np.mod(np.arctan2(cloud.tangent[:, 1], cloud.tangent[:, 0]), np.pi)
-    place = np.floor(cloud.points_map / _SEED_CELL_M)
-    cell = np.column_stack([place, np.floor(angle / np.pi * _DIRECTION_BINS)]).astype(np.int64)
-    seeds = np.unique(cell, axis=0, return_index=True)[1]
+    seeds = _seeds(cloud)
     points = cloud.points_map[seeds]
     tangent = cloud.tangent[seeds]
     # Pairs of seeds and points that can be neighbours in any iteration.
@@ -346,18 +343,30 @@ def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
     sigma_m = _kernel_sigma_m(points, tangent, cloud, pairs, least_images)
     for _ in range(_ITERATIONS):
         points, tangent = _shift(points, tangent, cloud, pairs, sigma_m)
-    in_line = _in_line(points, tangent, cloud, pairs)
-    in_reach = (np.abs(in_line.along_m) <= NODE_SPACING_M) & (np.abs(in_line.across_m) <= 0.5 * HALF_WIDTH_M)
-    in_reach &= in_line.cosine >= SAME_DIRECTION
-    seed = pairs.seed[in_reach]
-    point = pairs.point[in_reach]
-    seed_of_image = np.unique(np.stack([seed, cloud.image[point]]), axis=1)[0]
-    images = np.bincount(seed_of_image, minlength=len(points))
-    total = np.bincount(seed, minlength=len(points))
-    dash = np.bincount(seed, cloud.dash[point].astype(float), len(points)) / np.maximum(total, 1)
+    near = _near(points, tangent, cloud, pairs, (NODE_SPACING_M, 0.5 * HALF_WIDTH_M))
+    images = _images_of(near.seed, cloud.image[near.point], len(points))
+    total = np.bincount(near.seed, minlength=len(points))
+    dash = np.bincount(near.seed, cloud.dash[near.point].astype(float), len(points)) / np.maximum(total, 1)
     supported = np.flatnonzero(images >= least_images)
     chosen = supported[_thin(points[supported], tangent[supported], images[supported])]
     return Nodes(points[chosen], tangent[chosen], images[chosen], dash[chosen])
+
+
+def _seeds(cloud: LaneCloud) -> IntArray:
+    """The first point in each cell of position and direction, ascending by cell."""
+    angle = np.mod(np.arctan2(cloud.tangent[:, 1], cloud.tangent[:, 0]), np.pi)
+    place = np.floor(cloud.points_map / _SEED_CELL_M).astype(np.int64)
+    east, north = (place - place.min(axis=0)).T
+    direction = np.floor(angle / np.pi * _DIRECTION_BINS).astype(np.int64)
+    # One number for each cell: rows of three sort several times slower.
+    cell = (east * (north.max() + 1) + north) * (_DIRECTION_BINS + 1) + direction
+    return np.asarray(np.unique(cell, return_index=True)[1], dtype=np.int64)
+
+
+def _images_of(seed: IntArray, image: IntArray, count: int) -> IntArray:
+    """Number of different images (N,) that pairs of a seed and an image (K,) name for each of N seeds."""
+    numbers = int(image.max(initial=0)) + 1
+    return np.bincount(np.unique(seed * numbers + image) // numbers, minlength=count)
 
 
 class _Pairs(NamedTuple):
@@ -367,48 +376,57 @@ class _Pairs(NamedTuple):
     point: IntArray  # (K,)
 
 
-class _InLine(NamedTuple):
-    """Points of K pairs as their seeds see them."""
+class _Near(NamedTuple):
+    """The points that lie beside their seeds and run along them, of K pairs."""
 
+    seed: IntArray  # (K,)
+    point: IntArray  # (K,)
     along_m: FloatArray  # (K,) coordinate along the seed's line
     across_m: FloatArray  # (K,) coordinate to the left of it
-    cosine: FloatArray  # (K,) of the angle between both directions
 
 
-def _in_line(points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: _Pairs) -> _InLine:
-    """The points of ``pairs`` beside the lines through seeds at ``points`` (N, 2), along ``tangent``."""
+def _near(
+    points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: _Pairs, reach_m: tuple[float, float]
+) -> _Near:
+    """Those of ``pairs`` within ``reach_m``, along and across, of the lines through seeds.
+
+    The seeds are at ``points`` (N, 2), and their lines run along ``tangent`` (N, 2).
+    """
     seed, point = pairs
-    offset = cloud.points_map[point] - points[seed]
-    return _InLine(
-        along_m=np.einsum("pi,pi->p", offset, tangent[seed]),
-        across_m=cross(tangent[seed], offset),
-        cosine=np.abs(np.einsum("pi,pi->p", cloud.tangent[point], tangent[seed])),
-    )
+    along_seed = _complex(tangent).conj()
+    turned = (_complex(cloud.points_map)[point] - _complex(points)[seed]) * along_seed[seed]
+    beside = np.flatnonzero((np.abs(turned.real) <= reach_m[0]) & (np.abs(turned.imag) <= reach_m[1]))
+    seed = seed[beside]
+    point = point[beside]
+    cosine = np.abs((_complex(cloud.tangent)[point] * along_seed[seed]).real)
+    is_along = cosine >= SAME_DIRECTION
+    offset = turned[beside[is_along]]
+    return _Near(seed[is_along], point[is_along], offset.real.copy(), offset.imag.copy())
+
+
+def _complex(vectors: FloatArray) -> NDArray[np.complex128]:
+    """Vectors (N, 2) as complex numbers (N,): one is gathered, and turned, faster than two coordinates."""
+    return np.ascontiguousarray(vectors).view(np.complex128)[:, 0]
 
 
 def _kernel_sigma_m(
     points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: _Pairs, least_images: int
 ) -> FloatArray:
     """Sigmas (N,), m, across their lines of the weights about seeds: less where images show two lines."""
-    usual_m = np.full(len(points), _KERNEL_SIGMA_M)
+    count = len(points)
+    usual_m = np.full(count, _KERNEL_SIGMA_M)
     if not len(cloud.beside_m):
         return usual_m
-    in_line = _in_line(points, tangent, cloud, pairs)
-    in_reach = (np.abs(in_line.along_m) <= _HALF_LENGTH_M) & (np.abs(in_line.across_m) <= HALF_WIDTH_M)
-    in_reach &= in_line.cosine >= SAME_DIRECTION
-    seed = pairs.seed[in_reach]
-    point = pairs.point[in_reach]
-    shows_both = np.isfinite(cloud.beside_m[point])
-
-    def images_of(chosen: BoolArray) -> IntArray:
-        of_seed = np.unique(np.stack([seed[chosen], cloud.image[point[chosen]]]), axis=1)[0]
-        return np.bincount(of_seed, minlength=len(points))
-
-    double_count = images_of(shows_both)
-    image_count = images_of(np.ones_like(shows_both))
+    near = _near(points, tangent, cloud, pairs, (_HALF_LENGTH_M, HALF_WIDTH_M))
+    image = cloud.image[near.point]
+    beside_m = cloud.beside_m[near.point]
+    shows_both = np.isfinite(beside_m)
+    of_both = near.seed[shows_both]
+    double_count = _images_of(of_both, image[shows_both], count)
+    image_count = _images_of(near.seed, image, count)
     is_double = (double_count >= max(least_images, 1)) & (double_count >= _SHOW_BOTH * image_count)
-    total_m = np.bincount(seed[shows_both], cloud.beside_m[point[shows_both]], len(points))
-    mean_m = total_m / np.maximum(np.bincount(seed[shows_both], minlength=len(points)), 1)
+    total_m = np.bincount(of_both, beside_m[shows_both], count)
+    mean_m = total_m / np.maximum(np.bincount(of_both, minlength=count), 1)
     return np.where(is_double, np.minimum(usual_m, mean_m / _BESIDE_SIGMAS), usual_m)
 
 
@@ -419,19 +437,15 @@ def _shift(
 
     ``sigma_m`` (N,) is that of the weights across the line.
     """
-    in_line = _in_line(points, tangent, cloud, pairs)
-    in_reach = (np.abs(in_line.along_m) <= _HALF_LENGTH_M) & (np.abs(in_line.across_m) <= HALF_WIDTH_M)
-    in_reach &= in_line.cosine >= SAME_DIRECTION
-    x = in_line.along_m[in_reach]
-    y = in_line.across_m[in_reach]
+    seed, point, x, y = _near(points, tangent, cloud, pairs, (_HALF_LENGTH_M, HALF_WIDTH_M))
     # Gaussian across, so that the nearer of two lines wins.
-    across = y / sigma_m[pairs.seed[in_reach]]
+    across = y / sigma_m[seed]
     kernel = np.exp(-0.5 * across**2) * (1 - (x / _HALF_LENGTH_M) ** 2)
-    weight = cloud.weight[pairs.point[in_reach]] * kernel
+    weight = cloud.weight[point] * kernel
     count = len(points)
 
     def total(value: FloatArray) -> FloatArray:
-        return np.bincount(pairs.seed[in_reach], weights=value, minlength=count).astype(np.float64)
+        return np.bincount(seed, weights=value, minlength=count).astype(np.float64)
 
     w, wx, wy, wxx, wxy = (total(weight * v) for v in (np.ones_like(x), x, y, x * x, x * y))
     safe = np.maximum(w, 1e-12)
@@ -448,17 +462,18 @@ def _thin(points: FloatArray, tangent: FloatArray, images: IntArray) -> IntArray
     """Indices of the best supported nodes, at least 0.7 of the spacing apart along and beside a line."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
-    reach_m = _THIN_SPACINGS * NODE_SPACING_M
-    in_reach = cKDTree(points).query_ball_point(points, reach_m)
+    pairs = cKDTree(points).query_pairs(_THIN_SPACINGS * NODE_SPACING_M, output_type="ndarray")
+    node, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    across_m = cross(tangent[node], points[other] - points[node])
+    same = np.abs(np.einsum("pi,pi->p", tangent[node], tangent[other])) >= SAME_DIRECTION
+    same &= np.abs(across_m) <= 0.5 * HALF_WIDTH_M
+    node = node[same]
+    order = np.argsort(node, kind="stable")
+    others = np.split(other[same][order], np.searchsorted(node[order], np.arange(1, len(points))))
     alive = np.ones(len(points), dtype=bool)
     chosen = []
-    for node in np.argsort(-images, kind="stable").tolist():
-        if not alive[node]:
-            continue
-        chosen.append(node)
-        others = np.array(in_reach[node])
-        offset = points[others] - points[node]
-        across = cross(tangent[node], offset)
-        same = np.abs(tangent[others] @ tangent[node]) >= SAME_DIRECTION
-        alive[others[same & (np.abs(across) <= 0.5 * HALF_WIDTH_M)]] = False
+    for number in np.argsort(-images, kind="stable").tolist():
+        if alive[number]:
+            chosen.append(number)
+            alive[others[number]] = False
     return np.array(chosen, dtype=np.int64)
