@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from v2hdm.association.ground import BORDER_PX, Views
 from v2hdm.association.sightings import Rig
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
-from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray
 
@@ -74,7 +74,10 @@ class Watch:
         ends = np.argwhere(is_end)
         for group, side in ends[np.argsort(frame[ends[:, 0]], kind="stable")].tolist():
             end = _End.of(corners_map[group], side, self._height_m(corners_map[group]))
-            of_pairs = [self._better_ground(end, look, nearer, read) for look, nearer in self._pairs(end)]
+            face = end.face()
+            of_pairs = [
+                self._better_ground(end, face, look, nearer, read) for look, nearer in self._pairs(end)
+            ]
             differences_z = [value for value in of_pairs if value is not None]
             if differences_z:
                 odds[group, side] = _BIAS + _PER_BETTER_GROUND * float(np.mean(differences_z))
@@ -111,22 +114,23 @@ class Watch:
             image = int(self.views.image[rows[number]])
             yield _Look(image, info, cam_from_map[number], float(depth_m[number]))
 
-    def _better_ground(self, end: _End, farther: _Look, nearer: _Look, read: Grey) -> float | None:
-        """How much better two images match as ground than as a face; None where too few points tell.
+    def _better_ground(
+        self, end: _End, face: FloatArray, farther: _Look, nearer: _Look, read: Grey
+    ) -> float | None:
+        """How much better two images match as ground than as a ``face`` (N, 3); None: too few points tell.
 
         It is the difference of the correlations of their log grey values, in Fisher's z.
         """
-        face = end.face()
         as_seen = farther.project(face)
-        on_ground = np.column_stack([farther.ground(as_seen.px, end.middle_map[2]), face[:, 2] * 0])
-        on_ground[:, 2] = end.middle_map[2]
+        on_ground = np.full(face.shape, end.middle_map[2])
+        on_ground[:, :2] = farther.ground(as_seen.pinhole_px, end.middle_map[2])
         as_face = nearer.project(face)
         as_ground = nearer.project(np.nan_to_num(on_ground))
         away_m = np.linalg.norm(on_ground - end.middle_map, axis=1)
         usable = as_seen.inside & as_face.inside & as_ground.inside
         with np.errstate(invalid="ignore"):
             usable &= away_m < _FAR_M
-        usable &= np.linalg.norm(as_face.px - as_ground.px, axis=1) > _APART_PX
+        usable &= np.hypot(*(as_face.px - as_ground.px).T) > _APART_PX
         if np.count_nonzero(usable) < _LEAST_POINTS:
             return None
         # The nearer image is blurred to what the farther one resolves.
@@ -140,6 +144,7 @@ class Watch:
 class _Points(NamedTuple):
     """Where N points are in images (...)."""
 
+    pinhole_px: FloatArray  # (..., N, 2)
     px: FloatArray  # (..., N, 2) recorded px
     depth_m: FloatArray  # (..., N)
     inside: BoolArray  # (..., N) in front of the camera and off the image's border
@@ -150,11 +155,11 @@ def _project(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray)
     cam = points_map @ cam_from_map[..., :3, :3].swapaxes(-1, -2) + cam_from_map[..., None, :3, 3]
     depth_m = cam[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        pinhole = (cam / depth_m[..., None]) @ info.intrinsic.T
-        px = distort_points(info, pinhole[..., :2].reshape(-1, 2)).reshape(pinhole[..., :2].shape)
+        pinhole_px = ((cam / depth_m[..., None]) @ info.intrinsic.T)[..., :2]
+        px = distort_points(info, pinhole_px.reshape(-1, 2)).reshape(pinhole_px.shape)
         limit = np.array([info.width, info.height]) - BORDER_PX
         inside = (depth_m > _LEAST_DEPTH_M) & ((px > BORDER_PX) & (px < limit)).all(axis=-1)
-    return _Points(px, depth_m, np.asarray(inside))
+    return _Points(pinhole_px, px, depth_m, np.asarray(inside))
 
 
 class _Look(NamedTuple):
@@ -169,12 +174,12 @@ class _Look(NamedTuple):
         """Where points (N, 3) are in the image."""
         return _project(self.info, self.cam_from_map, points_map)
 
-    def ground(self, px: FloatArray, height_m: float) -> FloatArray:
-        """Ground points (N, 2) at a height of recorded pixels (N, 2), nan on and above the horizon."""
+    def ground(self, pinhole_px: FloatArray, height_m: float) -> FloatArray:
+        """Ground points (N, 2) at a height of pinhole pixels (N, 2), nan on and above the horizon."""
         cam_from_level = self.cam_from_map.copy()
         cam_from_level[:3, 3] += self.cam_from_map[:3, 2] * height_m
-        pinhole = undistort_points(self.info, np.nan_to_num(px))
-        return apply_in_front(ground_from_pinhole_px(self.info.intrinsic, cam_from_level), pinhole)
+        map_from_pinhole_px = ground_from_pinhole_px(self.info.intrinsic, cam_from_level)
+        return apply_in_front(map_from_pinhole_px, np.nan_to_num(pinhole_px))
 
 
 class _End(NamedTuple):
@@ -209,14 +214,14 @@ def _log_grey(
 
     Only the part of the image with the points is looked at: it is a small one.
     """
-    points = [px.astype(np.float32) for px in points_px]
+    points = [np.ascontiguousarray(px.T, dtype=np.float32) for px in points_px]
     margin = int(np.ceil(_BLUR_SIGMAS * blur_px)) + 2
-    corner = np.maximum(np.min([px.min(axis=0) for px in points], axis=0).astype(np.int64) - margin, 0)
-    end = np.max([px.max(axis=0) for px in points], axis=0).astype(np.int64) + margin + 1
+    corner = np.maximum(np.min([px.min(axis=1) for px in points], axis=0).astype(np.int64) - margin, 0)
+    end = np.max([px.max(axis=1) for px in points], axis=0).astype(np.int64) + margin + 1
     values = np.log(grey[corner[1] : end[1], corner[0] : end[0]] + np.float32(_DARK))
     if blur_px:
         values = cv2.GaussianBlur(values, (0, 0), blur_px)
-    maps = [(px - corner.astype(np.float32)).T for px in points]
+    maps = [px - corner.astype(np.float32)[:, None] for px in points]
     return [
         np.asarray(cv2.remap(values, u[None], v[None], cv2.INTER_LINEAR)[0], dtype=np.float64)
         for u, v in maps
