@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from skimage.draw import polygon
 
 from tests.cameras import mounted
 from tests.site.scene import (
@@ -29,7 +30,7 @@ from v2hdm.site.candidates import FOUND_SELDOM, LACKS_A_CORNER
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.site.polygons import Polygon
-from v2hdm.site.symbols import NO_POLYGON, map_symbols
+from v2hdm.site.symbols import NO_POLYGON, cells_inside, map_symbols
 
 
 def scene(arrow_x_m):
@@ -339,3 +340,12 @@ def test_an_arrow_of_which_each_image_cuts_another_end_is_whole(seed):
     (arrow,) = mapped(with_sides(symbols, outlines_px, 4 * [front_sides, back_sides]), rig)
     assert corner_errors_m(arrow, true).max() < 0.06
     assert squared_sigmas(arrow, true).max() < 2 * INSIDE_95
+
+
+@pytest.mark.parametrize("vertices", [3, 40])
+def test_the_cells_inside_an_outline_are_those_that_scikit_image_fills(vertices):
+    # Such an outline leaves the raster, and crosses itself.
+    ring = np.random.default_rng(vertices).uniform((-10.0, -10.0), (70.0, 50.0), (vertices, 2))
+    filled = np.zeros((40, 60), dtype=bool)
+    filled[polygon(ring[:, 1], ring[:, 0], filled.shape)] = True
+    np.testing.assert_array_equal(cells_inside(ring, filled.shape), filled)

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import cKDTree
-from skimage.draw import polygon
 from skimage.measure import find_contours
 
 from v2hdm.adjust import PoseSigma
@@ -402,13 +401,22 @@ def _covered(shapes: Sequence[FloatArray], cell_m: float) -> tuple[list[np.ndarr
     first = np.min([shape.min(axis=0) for shape in shapes], axis=0) - 2 * cell_m
     last = np.max([shape.max(axis=0) for shape in shapes], axis=0) + 2 * cell_m
     columns, lines = (np.ceil((last - first) / cell_m).astype(int) + 1).tolist()
-    masks = []
-    for shape in shapes:
-        x, y = ((shape - first) / cell_m).T
-        mask = np.zeros((lines, columns), dtype=np.bool_)
-        mask[polygon(y, x, mask.shape)] = True  # type: ignore[no-untyped-call]
-        masks.append(mask)
-    return masks, first
+    return [cells_inside((shape - first) / cell_m, (lines, columns)) for shape in shapes], first
+
+
+def cells_inside(ring: FloatArray, size: tuple[int, int]) -> BoolArray:
+    """Cells (h, w) of ``size`` with their centres inside a polygon (N, 2), whose x and y count cells.
+
+    Scikit-image asks each cell for all edges; here each line is crossed from left to right, once.
+    """
+    lines, columns = size
+    (x, y), (next_x, next_y) = ring.T, np.roll(ring, -1, axis=0).T
+    line = np.arange(lines)[:, None]
+    number, edge = np.nonzero((y <= line) != (next_y <= line))
+    share = (number - y[edge]) / (next_y - y)[edge]
+    right_of = np.ceil(x[edge] + share * (next_x - x)[edge]).astype(np.int64).clip(0, columns)
+    crossings = np.bincount(number * (columns + 1) + right_of, minlength=lines * (columns + 1))
+    return np.asarray(crossings.reshape(lines, -1).cumsum(axis=1)[:, :-1] % 2 > 0)
 
 
 def _fused_outline(
