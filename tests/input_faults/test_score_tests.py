@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.adjust.scene import PIXEL_SIGMA, Scene, exp, make_scene, project, with_late_clocks
+from tests.adjust.scene import PIXEL_SIGMA, Scene, exp, make_scene, project, with_ground, with_late_clocks
 from v2hdm.adjust import ControlPoints, KnownLengths, PoseSigma, SolveOptions, pose_innovations, solve
+from v2hdm.adjust.model import Estimate, prior_residuals, rigid
 from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.faults import Fault, table
+from v2hdm.faults.jacobians import priors_by_unknowns
 from v2hdm.faults.odds import is_contradicted
 from v2hdm.faults.score_tests import score_faults
 from v2hdm.faults.sensitivity import Sensitivity
@@ -381,6 +383,40 @@ def test_columns_that_are_solved_for_together_are_those_of_each_alone():
         # What is left of a column is at right angles to all that the unknowns explain.
         again = solved.efficient_columns([dict(zip(solved.places, split(solved, row), strict=True))])
         np.testing.assert_allclose(again[0], row, atol=1e-6 * np.abs(row).max())
+
+
+def test_the_derivatives_of_the_priors_are_those_of_small_steps():
+    street = scene()
+    problem = with_ground(with_late_clocks(street, np.array([0.02, -0.01])), 0.05, 0.005).problem
+    corners = street.corners_map
+    stated = KnownLengths(np.array([0, 5]), np.array([1, 6]), np.array([0.4, 0.5]), np.array([0.01, 0.02]))
+    control = ControlPoints(np.array([2, 9]), corners[[2, 9]] + 0.03, np.array([[0.01, 0.02], [0.03, 0.01]]))
+    problem = replace(problem, lengths=stated, control=control)
+    solution = solve(problem, replace(OPTIONS, clock_offset=True))
+    solved = Sensitivity.at(solution.covariance.whitening)
+    base = solved.whitening.estimate
+    generator = torch.Generator().manual_seed(1)
+    step = {
+        name: 1e-4 * torch.randn(shape, generator=generator, dtype=torch.float64)
+        for name, shape in {
+            "extrinsic": (len(base.cam_from_vehicle), 6),
+            "frame_state": base.frame_state.shape,
+            "corners_map": base.corners_map.shape,
+            "clock_s": base.clock_s.shape,
+        }.items()
+    }
+
+    def after(share):
+        moved = Estimate(
+            rigid(share * step["extrinsic"]) @ base.cam_from_vehicle,
+            *(getattr(base, name) + share * step[name] for name in ("frame_state", "corners_map", "clock_s")),
+        )
+        return torch.cat([row.flatten() for row in prior_residuals(solved.arrays, moved).values()])
+
+    by_unknowns = priors_by_unknowns(solved.arrays, base)
+    expected = ((after(1.0) - after(-1.0)) / 2).detach().numpy()
+    along = by_unknowns @ torch.cat([part.flatten() for part in step.values()]).numpy()
+    np.testing.assert_allclose(along, expected, atol=1e-6 * np.abs(expected).max())
 
 
 def split(solved, row):

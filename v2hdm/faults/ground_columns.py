@@ -83,8 +83,5 @@ def _turned(tangents: Tensor, solved: Sensitivity) -> Tensor:
 
 def _stretch(forward_m: Tensor, solved: Sensitivity) -> Tensor:
     """By how much (C,) the way is longer than recorded, for errors ahead (C, J): their slope over the way."""
-    position = solved.arrays.vehicle_from_map.inverse()[:, :3, 3]
-    step_m = position.diff(dim=0).norm(dim=1)
-    way_m = torch.nn.functional.pad(step_m.cumsum(dim=0), (1, 0))
-    way_m = way_m - way_m.mean()
+    way_m = solved.way_m
     return (forward_m @ way_m) / way_m.square().sum().clamp(min=1e-9)

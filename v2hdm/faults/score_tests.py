@@ -23,9 +23,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, stdtr
 
 from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.solution import Solution
@@ -67,18 +68,20 @@ class Segments:
         """Estimated value of the fault."""
         return float(self.score.sum() / self.information.sum())
 
-    @property
+    @cached_property
     def disagreement(self) -> float:
         """Variance of the segments' scores relative to that under the model's noise."""
-        by_model = float(np.mean([self._scatter(score) for score in self.drawn]))
-        return self._scatter(self.score) / max(by_model, 1e-300)
+        own, *by_model = self._scatter(np.vstack([self.score, self.drawn])).tolist()
+        return float(own / max(float(np.mean(by_model)), 1e-300))
 
-    def _scatter(self, score: FloatArray) -> float:
-        """Sum of squared residual scores (G + 1,), with Bartlett's weights of neighbours."""
-        off = (score - score.sum() / self.information.sum() * self.information)[:-1]
-        lags = range(1, _LAGS + 1)
-        of_neighbours = sum(2 * (1 - lag / (_LAGS + 1)) * float(off[lag:] @ off[:-lag]) for lag in lags)
-        return max(float(off @ off) + of_neighbours, 0.0)
+    def _scatter(self, scores: FloatArray) -> FloatArray:
+        """Sums (n,) of squared residual scores (n, G + 1), with Bartlett's weights of neighbours."""
+        values = scores.sum(axis=1, keepdims=True) / self.information.sum()
+        off = (scores - values * self.information)[:, :-1]
+        squared = np.square(off).sum(axis=1)
+        for lag in range(1, _LAGS + 1):
+            squared += 2 * (1 - lag / (_LAGS + 1)) * (off[:, lag:] * off[:, :-lag]).sum(axis=1)
+        return np.asarray(np.maximum(squared, 0.0))
 
     @property
     def freedom(self) -> float:
@@ -125,19 +128,19 @@ class _Answer(Segments):
         of_cameras = np.r_[tuple(solved.places[name] for name in _OF_CAMERAS)]
         surveys = efficient[:, of_cameras]
         survey_scores = -surveys @ solved.flat(solved.residuals)[of_cameras]
-        information = solved.information_by_stretch(efficient)
+        information = solved.information(efficient)
         noise = np.column_stack([-solved.flat(solved.residuals), solved.noise])
         scores = solved.by_stretch(efficient, noise)
         moves_m = _motions_m(hypotheses, columns, solved)
         return [
             cls(
                 score=scores[number, :, 0],
-                information=information[number],
+                information=information[number].sum(axis=1),
                 drawn=scores[number, :, 1:].T,
                 information_alone=sum(float(row.square().sum()) for row in columns[number].values()),
                 hypothesis=hypothesis,
                 of_surveys=(float(survey_scores[number]), float(np.square(surveys[number]).sum())),
-                by_noise=solved.by_noise(efficient[number]),
+                by_noise=information[number].sum(axis=0),
                 moves_m=float(moves_m[number]),
             )
             for number, hypothesis in enumerate(hypotheses)
@@ -181,7 +184,7 @@ class _Answer(Segments):
             value=self.value,
             sigma=sigma,
             model_sigma=total**-0.5,
-            p_value=2 * float(stats.t.sf(abs(self.value) / sigma, _PRIOR_FREEDOM + self.freedom)),
+            p_value=2 * float(stdtr(_PRIOR_FREEDOM + self.freedom, -abs(self.value) / sigma)),
             gain=gain,
         )
 
@@ -311,6 +314,6 @@ def _control_points(problem: Problem, solution: Solution, variance: float) -> It
             value=distance_m,
             sigma=test_sigma_m,
             model_sigma=test_sigma_m,
-            p_value=float(stats.chi2.sf(squared, 2)),
+            p_value=float(chdtrc(2, squared)),
             gain=squared / 2,
         )

@@ -17,7 +17,6 @@ from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.covariance import Moves
 from v2hdm.adjust.model import (
     Estimate,
-    Gradient,
     frame_tangent,
     points_in_camera,
     prior_residuals,
@@ -26,11 +25,10 @@ from v2hdm.adjust.model import (
 )
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
-from v2hdm.faults.jacobians import Jacobians, Steps, Whitened
+from v2hdm.faults.jacobians import Jacobians, Whitened
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 
-_STEP = 1e-3  # step of the priors' central differences, s or rad: millimetres of motion
 STRETCHES = 24  # segments of a session's route: metres each, longer than the correlation of most errors
 _DRAWS = 16  # draws of the model's noise, which give the expected disagreement to a tenth
 _ERRORS_OF_POSES = ((0, 1), (2,), (3, 4), (5,))
@@ -124,6 +122,14 @@ class Sensitivity:
         return poses.detach()
 
     @cached_property
+    def way_m(self) -> Tensor:
+        """Way (J,), m, along the recorded positions up to each frame, minus its mean."""
+        position = self.arrays.vehicle_from_map.inverse()[:, :3, 3]
+        step_m = position.diff(dim=0).norm(dim=1)
+        way_m = torch.nn.functional.pad(step_m.cumsum(dim=0), (1, 0))
+        return way_m - way_m.mean()
+
+    @cached_property
     def poses(self) -> Tensor:
         """``cam_from_map`` (K, 4, 4) of each observation."""
         pairs = self.whitening.engine.poses(self.whitening.estimate).flatten(0, 1)
@@ -176,18 +182,23 @@ class Sensitivity:
         These ``follow`` the columns; by default, to the optimum of this solution.
         """
         flat = self._flat_columns(columns)
-        steps = self.jacobians.steps(follow(self.whiten_columns(columns)))
-        flat[:, self.places["observations"]] += self.jacobians.along(steps).T
-        for number, numbers in enumerate(flat):
-            for name, along in self._priors_along(steps, number).items():
-                numbers[self.places[name]] += along.detach().flatten().cpu().numpy()
+        steps = self.jacobians.steps(follow(self._whiten(flat)))
+        observed = self.places["observations"]
+        flat[:, observed] += self.jacobians.along(steps).T
+        flat[:, observed.stop :] += self.jacobians.priors_along(steps).T
         return flat
 
     def whiten_columns(self, columns: Sequence[Rows]) -> Whitened:
         """Columns by the whitened unknowns."""
-        flat = self._flat_columns(columns)
-        of_observations = np.ascontiguousarray(flat[:, self.places["observations"]].T)
-        return self.jacobians.whiten(of_observations, [self._pulled(column) for column in columns])
+        return self._whiten(self._flat_columns(columns))
+
+    def _whiten(self, flat: FloatArray) -> Whitened:
+        """Columns (n, R) by the whitened unknowns."""
+        observed = self.places["observations"]  # the first ones
+        of_observations, of_priors = (
+            np.ascontiguousarray(flat[:, place].T) for place in (observed, slice(observed.stop, None))
+        )
+        return self.jacobians.whiten(of_observations, of_priors)
 
     def _flat_columns(self, columns: Sequence[Rows]) -> FloatArray:
         """Columns (n, R) as :meth:`flat` puts them."""
@@ -206,65 +217,13 @@ class Sensitivity:
             for (name, row), end in zip(self.residuals.items(), ends, strict=True)
         }
 
-    def _priors_along(self, steps: Steps, number: int) -> Rows:
-        """Derivatives of the priors' residuals along the step of column ``number``."""
-        base = self.whitening.estimate
-        extrinsic, states, clock, tangents, corners = (part[..., number] for part in steps)
-        # Derivatives are linear, poses are not: take a step that moves no pair by more than 1 m or rad.
-        share = _STEP / max(float(tangents.abs().max()), 1.0)
-
-        def after(share: float, motion: Tensor) -> Rows:
-            moved = Estimate(
-                motion @ base.cam_from_vehicle,
-                base.frame_state + share * states,
-                base.corners_map + share * corners,
-                base.clock_s + share * clock,
-            )
-            return _rows(self.arrays, moved)
-
-        forth, back = rigid(torch.stack([share * extrinsic, -share * extrinsic]))
-        high = after(share, forth)
-        low = after(-share, back)
-        return {name: (row - low[name]) / (2 * share) for name, row in high.items()}
-
-    @cached_property
-    def _priors(self) -> tuple[dict[str, Tensor], Rows]:
-        """The unknowns as leaves of a graph, by the names of :class:`Gradient`, and the priors' residuals."""
-        estimate = self.whitening.estimate
-        tangent = estimate.cam_from_vehicle.new_zeros(len(estimate.cam_from_vehicle), 6)
-        variables = {
-            "extrinsic": tangent,
-            "frame_state": estimate.frame_state,
-            "corners_map": estimate.corners_map,
-            "clock_s": estimate.clock_s,
-        }
-        leaves = {name: variable.clone().requires_grad_() for name, variable in variables.items()}
-        moved = Estimate(
-            rigid(leaves["extrinsic"]) @ estimate.cam_from_vehicle,
-            leaves["frame_state"],
-            leaves["corners_map"],
-            leaves["clock_s"],
-        )
-        return leaves, _rows(self.whitening.engine.arrays, moved)
-
-    def _pulled(self, column: Rows) -> Gradient | None:
-        """The priors' part of a column, by the unknowns; None where it has none."""
-        leaves, priors = self._priors
-        of_priors = [name for name in column if name != "observations"]
-        if not of_priors:
-            return None
-        # Of a sum: gradients handed to autograd would load sympy, for two seconds, to compare their shapes.
-        along = torch.stack([(priors[name] * column[name]).sum() for name in of_priors]).sum()
-        slopes = torch.autograd.grad(along, list(leaves.values()), retain_graph=True, materialize_grads=True)
-        return Gradient(**dict(zip(leaves, slopes, strict=True)))
-
     def moves(self, columns: FloatArray, follow: Follow = to_optimum) -> Moves:
         """Motion of the solution under unit errors with columns (2 K, B) of the observations' residuals.
 
         The unknowns ``follow`` them as in :meth:`efficient_columns`.
         """
         arrays = self.arrays
-        whitened = self.jacobians.whiten(columns, [None] * columns.shape[1])
+        whitened = self.jacobians.whiten(columns)
         steps = self.jacobians.steps(follow(whitened))
         of_corners = np.empty(tuple(steps.corners_map.shape))
         of_corners[arrays.corner_order.cpu().numpy()] = steps.corners_map.cpu().numpy()
@@ -297,10 +256,6 @@ class Sensitivity:
         by_kind["frame_states"][:] = self.arrays.centre.new_tensor(of_states)
         return self.flat(by_kind).astype(np.int64)
 
-    def by_noise(self, column: FloatArray) -> FloatArray:
-        """Information (N,) of a column (R,), by the kind of noise that limits it."""
-        return np.bincount(self._noise_of, np.square(column), minlength=NOISES).astype(np.float64)
-
     def by_stretch(self, columns: FloatArray, others: FloatArray) -> FloatArray:
         """Products (n, G + 1, ...) of columns (n, R) and others (R, ...) by segment; last, priors of none."""
         order, begin = self._stretch_of
@@ -309,13 +264,14 @@ class Sensitivity:
         parts = [slice(first, end) for first, end in pairwise(begin.tolist())]
         return np.stack([columns[:, part] @ others[part] for part in parts], axis=1)
 
-    def information_by_stretch(self, columns: FloatArray) -> FloatArray:
-        """Squared lengths (n, G + 1) of columns (n, R) by segment; last, priors of none."""
+    def information(self, columns: FloatArray) -> FloatArray:
+        """Squared lengths (n, G + 1, N) of columns (n, R) by segment, last of none, and kind of noise."""
         order, begin = self._stretch_of
         stretch = np.empty(len(order), dtype=np.int64)
         stretch[order] = np.repeat(np.arange(len(begin) - 1), np.diff(begin))
-        sums = [np.bincount(stretch, np.square(column), len(begin) - 1) for column in columns]
-        return np.array(sums, dtype=np.float64).reshape(-1, len(begin) - 1)
+        place = stretch * NOISES + self._noise_of
+        sums = [np.bincount(place, np.square(column), NOISES * (len(begin) - 1)) for column in columns]
+        return np.array(sums, dtype=np.float64).reshape(-1, len(begin) - 1, NOISES)
 
 
 def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
@@ -370,7 +326,7 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
         heights_m = by_column[:, begin : begin + _AT_ONCE]
         # Sparse: a height is seen in a few images.
         by_height = vstack([heights_m.multiply(along_u), heights_m.multiply(along_v)], format="csr")
-        whitened = solved.jacobians.whiten(by_height, [None] * heights_m.shape[1])
+        whitened = solved.jacobians.whiten(by_height)
         coupled[begin : begin + _AT_ONCE] = torch.cat([whitened.reduced, whitened.corners.flatten(0, 1)]).mT
     information[np.ix_(observed, observed)] -= (coupled @ coupled.mT).cpu().numpy()
     gradient = columns.T @ (unit * solved.residuals["observations"]).sum(0).cpu().numpy()
