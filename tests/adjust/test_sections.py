@@ -13,7 +13,7 @@ from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, sol
 from v2hdm.adjust.sections import rounds, summary
 from v2hdm.adjust.sections.blocks import BlockMatrix, BlockPattern
 from v2hdm.adjust.sections.parts import Part, cut
-from v2hdm.adjust.sections.rounds import Shape, save_part
+from v2hdm.adjust.sections.rounds import Job, Shape, Work, load_told, save_part
 from v2hdm.adjust.sections.solve import finish_parts, fit_parts, join_parts
 from v2hdm.adjust.sections.way import parts_of_way
 from v2hdm.adjust.whitening import factorise
@@ -131,6 +131,20 @@ def test_sections_of_a_street_are_the_street(tmp_path):
     assert part.max() == 3
     options = SolveOptions()
     check(in_sections(tmp_path, scene.problem, options, part), scene.problem, options)
+
+
+def test_the_information_of_a_border_stays_in_a_file_until_it_is_joined(tmp_path):
+    scene = make_scene(3, frames=40)
+    options = SolveOptions()
+    parts, _ = cut(scene.problem, np.arange(40) // 20, tuple(options.pose_states))
+    save_part(tmp_path, 0, parts[0])
+    state = Work(tmp_path, Shape.of(scene.problem, options))(Job(0))
+    unknowns = len(state.told.slope)
+    assert unknowns > 6
+    assert state.told.information.size == 0
+    information = load_told(tmp_path, 0, state).information
+    assert information.shape == (unknowns, unknowns)
+    np.testing.assert_allclose(information, information.T, rtol=1e-6, atol=1e-6 * information.max())
 
 
 def test_sections_that_are_solved_at_once_are_the_street(tmp_path):

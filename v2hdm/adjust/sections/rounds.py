@@ -1,6 +1,7 @@
 """One round of one part of a large problem: its whitening, what it says of its border, and its end.
 
-Parts are jobs of an executor. Between rounds their estimates and whitenings lie in files.
+Parts are jobs of an executor. Between rounds their estimates, their whitenings and the information of their
+borders lie in files.
 """
 
 from __future__ import annotations
@@ -65,7 +66,10 @@ class Shape(NamedTuple):
 
 
 class PartStates(NamedTuple):
-    """A part's border in a round: where it is, its value and what it tells."""
+    """A part's border in a round: where it is, its value and what it tells.
+
+    The information of ``told`` is in a file: :func:`load_told`.
+    """
 
     labels: Labels
     values: Values
@@ -123,7 +127,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Work:
-    """Rounds of parts whose files ``part_N``, ``stand_N`` and ``place_N`` are in ``folder``."""
+    """Rounds of parts whose files, ``part_N`` and what rounds leave, are in ``folder``."""
 
     folder: Path
     shape: Shape
@@ -178,10 +182,17 @@ class Work:
         self._keep("place", job.number, place)
         opened = stand.opened
         border = opened.border
-        told = summarise(stand.footing, place, opened.held, opened.held_map)
+        told = self._without_information(
+            job.number, summarise(stand.footing, place, opened.held, opened.held_map)
+        )
         order = opened.engine.arrays.corner_order.cpu().numpy()
         labels = labels_of(part, order, border.corners.cpu().numpy())
         return PartStates(labels, Values.of(place.estimate, border), told)
+
+    def _without_information(self, number: int, told: Summary) -> Summary:
+        """A summary whose information is left in a file: some 25 MB, of which few fit in one process."""
+        np.save(_information_file(self.folder, number), told.information)
+        return replace(told, information=np.zeros((0, 0)))
 
     def _first(self, job: Job, part: Part, opened: _Open) -> Estimate:
         """Where a part's rounds begin."""
@@ -297,3 +308,12 @@ def load_part(folder: Path, number: int) -> Part:
 def covariance_file(folder: Path, number: int) -> Path:
     """Where the joint covariance of a part's border is written."""
     return folder / f"covariance_{number}.npy"
+
+
+def load_told(folder: Path, number: int, state: PartStates) -> Summary:
+    """The whole of what a part has told in the last round."""
+    return replace(state.told, information=np.load(_information_file(folder, number)))
+
+
+def _information_file(folder: Path, number: int) -> Path:
+    return folder / f"information_{number}.npy"

@@ -29,7 +29,17 @@ from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.sections.blocks import BlockCholesky
 from v2hdm.adjust.sections.join import Joined, Labels, Net, Shared
 from v2hdm.adjust.sections.parts import Link, Part, whole_of
-from v2hdm.adjust.sections.rounds import GAP, Finish, Job, PartStates, Shape, Work, covariance_file, load_part
+from v2hdm.adjust.sections.rounds import (
+    GAP,
+    Finish,
+    Job,
+    PartStates,
+    Shape,
+    Work,
+    covariance_file,
+    load_part,
+    load_told,
+)
 from v2hdm.adjust.sections.summary import Summary, Values
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.solve import solve
@@ -158,7 +168,7 @@ def _in_rounds(
         elif number == 1 and (is_rough or is_from_afar):
             _check_agreement(net, states, least, costs, folder)
         shared = _shared(net, states)
-        joined = net.join(_taken(states, shared, net), shared)
+        joined = net.join(_all_told(folder, states, shared, net), shared)
         gap = (joined.decrease + sum(state.told.slack for state in states)) / max(sum(costs), 1.0)
         is_slow = gap > _SLOW * before
         before = gap
@@ -283,18 +293,16 @@ def _values(net: Net, shared: Shared, labels: Labels, like: Values) -> Values:
     )
 
 
-def _taken(states: list[PartStates], shared: Shared, net: Net) -> Iterator[Summary]:
-    """Evidence of all parts on the shared value; their information, which is large, leaves ``states``."""
-    nothing = np.zeros((0, 0))
+def _all_told(folder: Path, states: Sequence[PartStates], shared: Shared, net: Net) -> Iterator[Summary]:
+    """Evidence of all parts on the shared value, read part by part."""
     for number, state in enumerate(states):
-        yield _about(state, shared, net)
-        states[number] = state._replace(told=replace(state.told, information=nothing))
+        yield _about(load_told(folder, number, state), state, shared, net)
 
 
-def _about(state: PartStates, shared: Shared, net: Net) -> Summary:
+def _about(told: Summary, state: PartStates, shared: Shared, net: Net) -> Summary:
     """Evidence of a part on the shared value, which is not its own yet."""
     away = _values(net, shared, state.labels, state.values).step_from(state.values).cpu().numpy()
-    return replace(state.told, slope=state.told.slope + state.told.information @ away)
+    return replace(told, slope=told.slope + told.information @ away)
 
 
 def _moved(net: Net, shared: Shared, joined: Joined) -> Shared:
