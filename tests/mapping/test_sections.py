@@ -33,6 +33,7 @@ from v2hdm.mapping.sections.ours import Pairs
 from v2hdm.mapping.sections.run import map_in_sections
 from v2hdm.mapping.sections.section import sections_of
 from v2hdm.mapping.sections.work import Work
+from v2hdm.progress import Progress, silent
 from v2hdm.records import Image, ImageDetections, IntArray, PoseNoise, Session
 
 
@@ -56,12 +57,14 @@ class Elsewhere(type(HERE)):
             yield number, pickle.loads(pickle.dumps(result))
 
 
-def in_sections(scene: Scene, folder: Path, most_m: float = 65.0, **options: object) -> MethodResult:
+def in_sections(
+    scene: Scene, folder: Path, most_m: float = 65.0, progress: Progress = silent, **options: object
+) -> MethodResult:
     """The map of a scene in sections."""
     cameras = list(scene.drive.cameras)
     source = Listed(scene.detections)
     chosen = MappingOptions(**options)
-    return map_in_sections(scene.drive, source, cameras, chosen, most_m, Elsewhere(), folder)
+    return map_in_sections(scene.drive, source, cameras, chosen, most_m, Elsewhere(), folder, progress)
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +73,15 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def result(scene, tmp_path_factory) -> MethodResult:
-    return in_sections(scene, tmp_path_factory.mktemp("sections"))
+def told() -> list[tuple[str, int, int]]:
+    """The progress of the mapping of ``result``."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def result(scene, told, tmp_path_factory) -> MethodResult:
+    folder = tmp_path_factory.mktemp("sections")
+    return in_sections(scene, folder, progress=lambda *step: told.append(step))
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +96,11 @@ def test_sections_have_every_image_once_as_their_own(scene):
     assert len(sections) == 2
     np.testing.assert_array_equal(np.sort(numbers), np.arange(len(scene.drive.images)))
     assert all(not section.is_own.all() for section in sections)
+
+
+def test_the_steps_of_the_sections_are_told_one_by_one(result, told):
+    for step in ("map sections", "propose markings", "finish sections"):
+        assert [(done, total) for name, done, total in told if name == step] == [(0, 2), (1, 2), (2, 2)]
 
 
 def test_the_map_is_that_of_the_drive(result, whole):

@@ -158,6 +158,7 @@ def _in_rounds(
     are_joined = jobs[0].start is not None
     is_from_afar = not are_joined and not jobs[0].is_near
     before = np.inf
+    joined: Joined | None = None
     for number in range(_MOST_ROUNDS):
         report(number, _MOST_ROUNDS)
         states: list[PartStates] = _side_by_side(executor, work, jobs)
@@ -168,6 +169,7 @@ def _in_rounds(
         elif number == 1 and (is_rough or is_from_afar):
             _check_agreement(net, states, least, costs, folder)
         shared = _shared(net, states)
+        joined = None  # the factor of the round before is as large as the one that is made now
         joined = net.join(_all_told(folder, states, shared, net), shared)
         gap = (joined.decrease + sum(state.told.slack for state in states)) / max(sum(costs), 1.0)
         is_slow = gap > _SLOW * before
@@ -187,6 +189,7 @@ def _in_rounds(
         ]
     last = [Job(part, is_last=True, gap=gap, rounds=number + 1) for part in range(len(states))]
     results = _side_by_side(executor, replace(work, finish=finish), last)
+    assert joined is not None
     return Joint(results, net, joined.factor, gap, number + 1)
 
 
@@ -228,25 +231,38 @@ def _solved_at_once(folder: Path, count: int, shape: Shape, most: int) -> _AtOnc
 
 
 def finish_parts(
-    folder: Path, joint: Joint, shape: Shape, finish: Finish, executor: Executor = HERE
+    folder: Path,
+    joint: Joint,
+    shape: Shape,
+    finish: Finish,
+    executor: Executor = HERE,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Any]:
     """Results of ``finish`` for each joined part, whose solution has its joint covariances.
 
-    Raises WorkerError where a process died.
+    ``progress`` is called with how many are done, and of how many. Raises WorkerError where a process died.
     """
     jobs = [
         Job(part, is_finish=True, gap=joint.gap, rounds=joint.rounds) for part in range(len(joint.net.labels))
     ]
-    return _side_by_side(executor, Work(folder, shape, finish), jobs)
+    return _side_by_side(executor, Work(folder, shape, finish), jobs, progress)
 
 
-def _side_by_side(executor: Executor, work: Work, jobs: Sequence[Job]) -> list[Any]:
+def _side_by_side(
+    executor: Executor,
+    work: Work,
+    jobs: Sequence[Job],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Any]:
+    report = progress or (lambda done, total: None)
+    report(0, len(jobs))
     results: dict[int, Any] = {}
     with closing(executor.side_by_side(work, jobs)) as outcomes:
         for number, outcome in outcomes:
             if isinstance(outcome, WorkerError):
                 raise outcome
             results[number] = outcome
+            report(len(results), len(jobs))
     return [results[number] for number in range(len(jobs))]
 
 

@@ -114,12 +114,13 @@ def map_in_sections(
     )
     del sections
     solved = _joint_solve(run, drive, part, alone)
-    proposals: list[Proposal] = run.finish(solved, solved.work.propose)
+    proposals: list[Proposal] = run.finish(solved, solved.work.propose, "propose markings")
     heard = _classified(run, solved, proposals, options.acceptance)
     clock_root = _clock_root(run, solved, [proposal.clock_slopes for proposal in proposals], drive)
     candidate_count = sum(len(proposal.kinds) for proposal in proposals)
     del proposals
-    finished: list[Finished] = run.finish(solved, replace(solved.work, clock_root=clock_root).finish)
+    with_clocks = replace(solved.work, clock_root=clock_root)
+    finished: list[Finished] = run.finish(solved, with_clocks.finish, "finish sections")
     result = merged([section.result for section in finished], drive, own_images)
     assert result.evidence is not None
     lanes = lanes_along(join_paths([path for section in finished for path in section.lanes]), options.lanes)
@@ -157,9 +158,10 @@ class _Run:
                 self.progress(step, len(results), len(todo))
         return [results[number] for number in range(len(todo))]
 
-    def finish(self, solved: _Solved, finish: Callable[..., Any]) -> list[Any]:
+    def finish(self, solved: _Solved, finish: Callable[..., Any], step: str) -> list[Any]:
         """Results of ``finish`` for all sections under their last joint solve."""
-        return finish_parts(self.work.folder, solved.joint, solved.shape, finish, self.executor)
+        progress = partial(self.progress, step)
+        return finish_parts(self.work.folder, solved.joint, solved.shape, finish, self.executor, progress)
 
 
 class _Solved(NamedTuple):
@@ -305,7 +307,8 @@ def _clock_root(
         return None
     for number, steps in enumerate(solved.joint.steps(told)):
         run.work.write("clock_steps", number, steps)
-    return second_moments(evidence_of(run.finish(solved, solved.work.weigh_clocks)), drive.noises)
+    parts = run.finish(solved, solved.work.weigh_clocks, "weigh clocks")
+    return second_moments(evidence_of(parts), drive.noises)
 
 
 def _classified(
