@@ -14,7 +14,7 @@ from tests.mosaic import scene
 from v2hdm.cli.main import run
 from v2hdm.geometry.geodetic import crs_of, geodetic_from_enu
 from v2hdm.mosaic.blend import Sheet
-from v2hdm.mosaic.result import Picture, geotiff
+from v2hdm.mosaic.result import Picture, _shown_blocks, geotiff
 from v2hdm.mosaic.views import Canvas
 from v2hdm.store.names import METRICS
 
@@ -85,6 +85,14 @@ def test_a_picture_is_reduced_until_it_can_be_drawn_and_keeps_its_colours():
     picture.put(Sheet(0, 2048, rgba))
     np.testing.assert_array_equal(picture._rgba[0, 1024], [200, 100, 50, 128])
     assert not picture._rgba[:, :1024].any()
+
+
+def test_of_a_sheet_only_blocks_that_show_something_are_written():
+    rgba = np.zeros((1024, 768, 4), dtype=np.uint8)
+    rgba[600, 700] = [200, 100, 50, 1]
+    (block,) = _shown_blocks(Sheet(2048, 4096, rgba))
+    assert (block.row, block.column) == (2048 + 512, 4096 + 512)
+    np.testing.assert_array_equal(block.rgba, rgba[512:, 512:])
 
 
 def said_of_drive(folder, **values):

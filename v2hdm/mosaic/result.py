@@ -138,6 +138,16 @@ def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterat
                     file.write(data)
 
 
+def _shown_blocks(sheet: Sheet) -> Iterator[Sheet]:
+    """The blocks of a sheet of which anything is shown: of a road most of it is empty."""
+    rows, columns = sheet.rgba.shape[:2]
+    for row in range(0, rows, _BLOCK_PX):
+        for column in range(0, columns, _BLOCK_PX):
+            rgba = sheet.rgba[row : row + _BLOCK_PX, column : column + _BLOCK_PX]
+            if rgba[..., 3].any():
+                yield Sheet(sheet.row + row, sheet.column + column, rgba)
+
+
 class Picture:
     """A mosaic reduced by a power of two so that no side is above :data:`LARGEST_PICTURE_PX`."""
 
@@ -153,13 +163,15 @@ class Picture:
         rows, columns = (side // self.factor for side in sheet.rgba.shape[:2])
         row = sheet.row // self.factor
         column = sheet.column // self.factor
-        alpha = sheet.rgba[..., 3:].astype(np.float32) / 255
-        weighed = np.concatenate([sheet.rgba[..., :3] * alpha, alpha], axis=2)
-        reduced = cv2.resize(weighed, (columns, rows), interpolation=cv2.INTER_AREA)
-        opacity = reduced[..., 3:]
-        colours = np.divide(reduced[..., :3], opacity, out=np.zeros_like(reduced[..., :3]), where=opacity > 0)
-        drawn = np.round(np.concatenate([colours, 255 * opacity], axis=2))
-        self._rgba[row : row + rows, column : column + columns] = drawn
+        *colours, alpha = (plane.astype(np.float32) for plane in cv2.split(sheet.rgba))
+        alpha /= 255
+        opacity, *weighed = (
+            cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_AREA)
+            for plane in (alpha, *(colour * alpha for colour in colours))
+        )
+        visible = np.where(opacity > 0, opacity, 1)
+        drawn = cv2.merge([*(colour / visible for colour in weighed), 255 * opacity])
+        self._rgba[row : row + rows, column : column + columns] = np.rint(drawn)
 
     def write(self, path: Path) -> None:
         """Write it as WebP, transparent where nothing was seen; whole or not at all."""
@@ -225,9 +237,10 @@ def write_mosaic(
         for sheet in blend(
             ground.canvas, ground.after, ground.lenses, progress, consensus, ground.area, executor
         ):
-            if put is not None:
-                put(sheet)
-            picture.put(sheet)
+            for block in _shown_blocks(sheet):
+                if put is not None:
+                    put(block)
+                picture.put(block)
     picture.write(folder / names.MOSAIC_PICTURE)
     content = {
         "image": names.MOSAIC_PICTURE,
