@@ -22,7 +22,19 @@ from v2hdm.geometry.ipm import apply_homography
 from v2hdm.mosaic.choice import Candidate, chosen
 from v2hdm.mosaic.consensus import Consensus, share_of
 from v2hdm.mosaic.views import Canvas, Lens, Shot
-from v2hdm.mosaic.warp import TILE_PX, Area, SheetPlan, Sources, Views, Warp, over_sheets, plan_sheets, sample
+from v2hdm.mosaic.warp import (
+    TILE_PX,
+    Area,
+    Pixels,
+    SheetPlan,
+    Sources,
+    Views,
+    Warp,
+    over_sheets,
+    plan_sheets,
+    sample,
+)
+from v2hdm.native import kernels
 from v2hdm.progress import Progress, Steps
 
 SHEET_PX = 2048  # side of a sheet, px of the canvas: 84 MB of weighted sums where all of it is seen
@@ -101,7 +113,7 @@ class _Blend:
         warp = Warp(map_from_sheet, step_px)
         images = self._sources.in_order([index for index, _ in views])
         for (index, tiles), pixels in zip(views, images, strict=True):
-            sums.add(tiles, self._contribution(index, tiles, pixels, warp))
+            self._add(sums, index, tiles, pixels, warp)
         return Sheet(plan.row, plan.column, sums.mean(rows, columns))
 
     def _chosen(self, views: Views, warp: Warp) -> Views:
@@ -112,9 +124,7 @@ class _Blend:
             lens = self._lenses[shot.camera]
             nodes = warp.nodes(shot, lens, tiles)
             places_px = (nodes.x_px.astype(np.float32), nodes.y_px.astype(np.float32))
-            trust = sample(lens.trusted_part, *places_px)
-            if self._consensus is not None:
-                trust *= share_of(self._consensus.shown(index, warp.nodes_map(tiles)))
+            trust = sample(lens.trusted_part, *places_px) * share_of(self._shown(index, tiles, warp))
             counts = self._counts(trust, nodes.density.astype(np.float32))
             flat = (len(tiles), -1)
             candidates.append(
@@ -122,20 +132,32 @@ class _Blend:
             )
         return chosen(candidates)
 
-    def _contribution(
-        self, index: int, tiles: np.ndarray, pixels: np.ndarray, warp: Warp
-    ) -> list[np.ndarray]:
-        """The five addends (T, pixels) of an image to the sums of tiles (T, 2)."""
+    def _shown(self, index: int, tiles: np.ndarray, warp: Warp) -> np.ndarray:
+        """How far an image shows the ground at the nodes (T, side, side) of tiles (T, 2), float32."""
+        nodes_map = warp.nodes_map(tiles)
+        if self._consensus is None:
+            return np.ones(nodes_map.shape[:-1], dtype=np.float32)
+        return self._consensus.shown(index, nodes_map)
+
+    def _add(self, sums: _Sums, index: int, tiles: np.ndarray, pixels: np.ndarray, warp: Warp) -> None:
+        """Add what an image shows to the sums of tiles (T, 2)."""
         shot = self._shots[index]
-        lens = self._lenses[shot.camera]
-        where = warp.pixels(warp.nodes(shot, lens, tiles))
-        bgra = cv2.cvtColor(pixels, cv2.COLOR_BGR2BGRA)
-        bgra[..., 3] = self._alphas[shot.camera]
-        *colours, alpha = cv2.split(sample(bgra, where.x_px, where.y_px).reshape(len(tiles), -1, 4))
-        trust = alpha * np.float32(1 / 255)
-        if self._consensus is not None:
-            shown = warp.between(self._consensus.shown(index, warp.nodes_map(tiles)))
-            trust *= share_of(shown).reshape(trust.shape)
+        nodes = warp.nodes(shot, self._lenses[shot.camera], tiles)
+        shown = self._shown(index, tiles, warp)
+        alpha = self._alphas[shot.camera]
+        compiled = kernels()
+        if compiled is None:
+            bgra = np.dstack([pixels, alpha])
+            sums.add(tiles, self._contribution(bgra, warp.pixels(nodes), warp.between(shown)))
+            return
+        fullness = 1 / self._full_density
+        compiled.ground.add(sums.sums, sums.slots(tiles), nodes, shown, pixels, alpha, fullness, _FINEST)
+
+    def _contribution(self, bgra: np.ndarray, where: Pixels, shown: np.ndarray) -> list[np.ndarray]:
+        """The five addends (T, pixels) of an image that shows the ground so far at pixels of tiles."""
+        count = len(shown)
+        *colours, alpha = cv2.split(sample(bgra, where.x_px, where.y_px).reshape(count, -1, 4))
+        trust = alpha * np.float32(1 / 255) * share_of(shown).reshape(count, -1)
         counts = self._counts(trust, where.density.reshape(trust.shape))
         weighted = [colour * counts.weight for colour in colours]
         return [*weighted, counts.weight, counts.opacity]
@@ -177,25 +199,37 @@ class _Sums:
     """The sums of weighted colours (B, G, R), weights and opacities of the pixels of some tiles."""
 
     def __init__(self, tiles: np.ndarray) -> None:
-        self._tiles = np.unique(tiles, axis=0)
-        self._at = {(int(column), int(row)): k for k, (column, row) in enumerate(self._tiles)}
-        self._sums = np.zeros((5, len(self._tiles), TILE_PX**2), dtype=np.float32)
+        is_there = np.zeros(tiles.max(axis=0) + 1, dtype=np.bool_)
+        is_there[tiles[:, 0], tiles[:, 1]] = True
+        self._tiles = np.argwhere(is_there)
+        self._slots = np.cumsum(is_there).reshape(is_there.shape) - 1
+        self.sums = np.zeros((5, len(self._tiles), TILE_PX**2), dtype=np.float32)
+
+    def slots(self, tiles: np.ndarray) -> np.ndarray:
+        """The places (T,) of tiles (T, 2) of (column, row) among those of :attr:`sums`."""
+        return np.asarray(self._slots[tiles[:, 0], tiles[:, 1]])
 
     def add(self, tiles: np.ndarray, contribution: Sequence[np.ndarray]) -> None:
         """Add what an image contributes, five times (T, pixels), to tiles (T, 2) of (column, row)."""
-        at = [self._at[int(column), int(row)] for column, row in tiles]
-        for total, addend in zip(self._sums, contribution, strict=True):
-            total[at] += addend
+        slots = self.slots(tiles)
+        for total, addend in zip(self.sums, contribution, strict=True):
+            total[slots] += addend
 
     def mean(self, rows: int, columns: int) -> np.ndarray:
         """The sheet as (rows, columns, 4) uint8 RGBA."""
-        weight = self._sums[3]
-        colours = self._sums[2::-1] / np.where(weight > 0, weight, 1)
-        alpha = (255 * self._sums[4:]).clip(max=255)
-        rgba = np.rint(np.concatenate([colours, alpha])).astype(np.uint8)
         side = TILE_PX
         down = -(-rows // side)
         across = -(-columns // side)
         out = np.zeros((down, side, across, side, 4), dtype=np.uint8)
-        out[self._tiles[:, 1], :, self._tiles[:, 0]] = np.moveaxis(rgba, 0, -1).reshape(-1, side, side, 4)
+        out[self._tiles[:, 1], :, self._tiles[:, 0]] = self._rgba().reshape(-1, side, side, 4)
         return out.reshape(down * side, -1, 4)[:rows, :columns]
+
+    def _rgba(self) -> np.ndarray:
+        """Colours and alpha of all tiles, their last axis."""
+        compiled = kernels()
+        if compiled is not None:
+            return np.asarray(compiled.ground.mean(self.sums))
+        weight = self.sums[3]
+        colours = self.sums[2::-1] / np.where(weight > 0, weight, 1)
+        alpha = (255 * self.sums[4:]).clip(max=255)
+        return np.moveaxis(np.rint(np.concatenate([colours, alpha])).astype(np.uint8), 0, -1)

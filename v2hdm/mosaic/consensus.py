@@ -22,6 +22,7 @@ from v2hdm.executor import HERE, Executor
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.mosaic.views import Canvas, Lens, Shot
 from v2hdm.mosaic.warp import TILE_PX, Area, SheetPlan, Sources, Warp, over_sheets, plan_sheets, sample
+from v2hdm.native import kernels
 from v2hdm.progress import Progress, Steps
 from v2hdm.records import BoolArray, FloatArray
 
@@ -80,9 +81,9 @@ class Consensus:
         shown = self.by_shot.get(index)
         if shown is None:
             return np.zeros(points_map.shape[:-1], dtype=np.float32)
-        offset_m = points_map - self.canvas.corner_map
-        column = offset_m[..., 0] / BLOCK_M - 0.5 - shown.column
-        row = -offset_m[..., 1] / BLOCK_M - 0.5 - shown.row
+        west_m, north_m = self.canvas.corner_map
+        column = (points_map[..., 0] - west_m) / BLOCK_M - 0.5 - shown.column
+        row = (north_m - points_map[..., 1]) / BLOCK_M - 0.5 - shown.row
         return sample(shown.shows, column.astype(np.float32), row.astype(np.float32))
 
 
@@ -198,6 +199,9 @@ class _Comparison:
         self._lenses = lenses
         self._canvas = canvas
         self._sources = Sources(shots, lenses, is_grey=True)
+        self._trusted = {
+            name: np.where(lens.trusted_part > 0, np.uint8(255), np.uint8(0)) for name, lens in lenses.items()
+        }
 
     def __call__(self, plan: SheetPlan, progress: Progress) -> list[_Tile]:
         map_from_sheet = self._canvas.window(plan.row, plan.column, _SHEET_PX, _SHEET_PX).map_from_canvas
@@ -224,13 +228,17 @@ class _Comparison:
         shot = self._shots[index]
         lens = self._lenses[shot.camera]
         nodes = warp.nodes(shot, lens, tiles)
-        where = warp.pixels(nodes)
-        trusted = np.where(lens.trusted_part > 0, np.uint8(255), np.uint8(0))
-        is_whole = _all_of_block(sample(trusted, where.x_px, where.y_px))
-        density = nodes.density[:, 1::2, 1::2] * is_whole  # in the middle of blocks
-        density[density < _COARSEST] = 0
+        trusted = self._trusted[shot.camera]
+        compiled = kernels()
         # As decimals, since whole grey values would add to the pattern of asphalt.
-        greys = sample(pixels.astype(np.float32), where.x_px, where.y_px)
+        if compiled is None:
+            where = warp.pixels(nodes)
+            greys = sample(pixels.astype(np.float32), where.x_px, where.y_px)
+            is_trusted = sample(trusted, where.x_px, where.y_px) > 0
+        else:
+            greys, is_trusted = compiled.ground.look(nodes, pixels, trusted)
+        density = nodes.density[:, 1::2, 1::2] * _all_of_block(is_trusted)  # in the middle of blocks
+        density[density < _COARSEST] = 0
         for tile, grey, fineness in zip(tiles, greys, density.astype(np.float32), strict=True):
             if fineness.any():
                 yield (int(tile[0]), int(tile[1])), _Patch(index, grey, fineness)
@@ -246,11 +254,11 @@ class _Comparison:
         return (centres_map[:, :, None] - cameras_map[:, :2]) / cameras_map[:, 2:]
 
 
-def _all_of_block(values: np.ndarray) -> BoolArray:
-    """Which blocks (T, blocks, blocks) have values above 0 in all of their cells (T, TILE_PX, TILE_PX)."""
-    count = len(values)
-    by_column = values.reshape(count, _BLOCKS, BLOCK_PX, TILE_PX).min(axis=2)
-    return np.asarray(by_column.reshape(count, _BLOCKS, _BLOCKS, BLOCK_PX).min(axis=3) > 0)
+def _all_of_block(flags: BoolArray) -> BoolArray:
+    """Which blocks (T, blocks, blocks) have all of their cells (T, TILE_PX, TILE_PX) flagged."""
+    count = len(flags)
+    by_column = flags.reshape(count, _BLOCKS, BLOCK_PX, TILE_PX).all(axis=2)
+    return np.asarray(by_column.reshape(count, _BLOCKS, _BLOCKS, BLOCK_PX).all(axis=3))
 
 
 def _compare(patches: Sequence[_Patch], directions: FloatArray) -> tuple[np.ndarray, BoolArray]:

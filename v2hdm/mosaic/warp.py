@@ -189,6 +189,11 @@ def sample(image: np.ndarray, x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
     return values.reshape(*x_px.shape, *image.shape[2:])
 
 
+def _homogeneous(dst_from_src: FloatArray, x: FloatArray, y: FloatArray) -> list[FloatArray]:
+    """The three coordinates of points, each in an array of its own, mapped by a homography (3, 3)."""
+    return [(by_x * x + offset) + by_y * y for by_x, by_y, offset in dst_from_src]
+
+
 class Nodes(NamedTuple):
     """Where nodes of tiles, each (T, side, side), lie in an image that is cut to what is trusted."""
 
@@ -218,41 +223,46 @@ class Warp:
         """Nodes are ``step_px`` of the canvas apart, which divides :data:`TILE_PX`."""
         self._map_from_sheet = map_from_sheet
         at_px = np.arange(0, TILE_PX + 1, step_px)
-        self._nodes_px = np.stack(np.meshgrid(at_px, at_px), axis=-1)
-        x, y = np.moveaxis(self._nodes_px / TILE_PX, -1, 0)
+        self._at_px = at_px
+        x, y = np.meshgrid(at_px / TILE_PX, at_px / TILE_PX)
         self._from_corners = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
         distance_px = np.abs(np.arange(TILE_PX)[:, None] - at_px)
         # Hat functions (TILE_PX, nodes of a side).
         self._from_nodes = (1 - distance_px / step_px).clip(min=0).astype(np.float32)
 
-    def _nodes_of(self, tiles: np.ndarray) -> FloatArray:
-        """The nodes (T, side, side, 2) of tiles (T, 2) of (column, row), px of the sheet."""
-        return np.asarray(TILE_PX * tiles[:, None, None] + self._nodes_px, dtype=np.float64)
+    def _nodes_of(self, tiles: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        """The nodes of tiles (T, 2) of (column, row), px of the sheet: x (T, 1, side) and y (T, side, 1)."""
+        x, y = np.asarray(TILE_PX * tiles.T[..., None] + self._at_px, dtype=np.float64)
+        return x[:, None], y[:, :, None]
 
     def nodes_map(self, tiles: np.ndarray) -> FloatArray:
         """The nodes (T, side, side, 2) of tiles (T, 2) of (column, row), m in the map."""
-        return apply_homography(self._map_from_sheet, self._nodes_of(tiles))
+        x, y, third = _homogeneous(self._map_from_sheet, *self._nodes_of(tiles))
+        return np.stack([x / third, y / third], axis=-1)
 
     def nodes(self, shot: Shot, lens: Lens, tiles: np.ndarray) -> Nodes:
         """Where the nodes of tiles (T, 2) of (column, row) lie in an image."""
-        points = self._nodes_of(tiles)
+        x, y = self._nodes_of(tiles)
         if shot.on_plane is not None:
             corners = TILE_PX * (tiles[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]])).reshape(-1, 2)
             sheet_from_map = np.asarray(np.linalg.inv(self._map_from_sheet), dtype=np.float64)
             moved = shot.on_plane(apply_homography(self._map_from_sheet, corners.astype(np.float64)))
             moved_px = apply_homography(sheet_from_map, moved) - corners
-            points = points + self._from_corners @ moved_px.reshape(-1, 1, 4, 2)
+            moves = np.moveaxis(self._from_corners @ moved_px.reshape(-1, 1, 4, 2), -1, 0)
+            x = x + moves[0]
+            y = y + moves[1]
         pinhole_px_from_sheet = shot.pinhole_px_from_map @ self._map_from_sheet
-        homogeneous = points @ pinhole_px_from_sheet[:, :2].T + pinhole_px_from_sheet[:, 2]
-        third = homogeneous[..., 2]
+        across, down, third = _homogeneous(pinhole_px_from_sheet, x, y)
         with np.errstate(all="ignore"):  # in the camera's plane, where the lens has no end
-            pinhole_px = homogeneous[..., :2] / third[..., None]
-            px = distort_points(lens.info, pinhole_px.reshape(-1, 2)).reshape(points.shape)
+            pinhole_px = np.stack([across / third, down / third], axis=-1)
+            px = distort_points(lens.info, pinhole_px.reshape(-1, 2)).reshape(pinhole_px.shape)
         rows, columns = lens.trusted_box
-        # What lies far out must not spoil the rest of its tile.
-        placed = np.nan_to_num(px - (columns.start, rows.start), nan=_FAR_OUT_PX)
-        placed = placed.clip(-_FAR_OUT_PX, _FAR_OUT_PX)
-        return Nodes(placed[..., 0], placed[..., 1], third, float(np.linalg.det(pinhole_px_from_sheet)))
+        # What lies far out, or nowhere, must not spoil the rest of its tile.
+        x_px, y_px = (
+            np.fmax(np.fmin(px[..., axis] - first, _FAR_OUT_PX), -_FAR_OUT_PX)
+            for axis, first in enumerate((columns.start, rows.start))
+        )
+        return Nodes(x_px, y_px, third, float(np.linalg.det(pinhole_px_from_sheet)))
 
     def between(self, values: np.ndarray) -> np.ndarray:
         """Values (..., side, side) of nodes at the pixels (..., TILE_PX, TILE_PX) of their tiles, float32."""

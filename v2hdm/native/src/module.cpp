@@ -12,6 +12,7 @@ NB_MODULE(_kernels, module) {
     v2hdm::add_pieces(module);
     v2hdm::add_views(module);
     v2hdm::add_lens(module);
+    v2hdm::add_ground(module);
     v2hdm::add_seeing(module);
     v2hdm::add_adjust(module);
 }

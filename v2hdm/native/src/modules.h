@@ -12,6 +12,7 @@ void add_paint(nanobind::module_& module);
 void add_pieces(nanobind::module_& module);
 void add_views(nanobind::module_& module);
 void add_lens(nanobind::module_& module);
+void add_ground(nanobind::module_& module);
 void add_seeing(nanobind::module_& module);
 void add_adjust(nanobind::module_& module);
 void add_adjust_rig(nanobind::module_& adjust);
