@@ -322,11 +322,11 @@ def test_what_must_be_light_loads_nothing_heavy_and_the_base_install_is_enough_o
 LOADED = """
 import sys
 import v2hdm.pipeline.map_drive
-print(*(name for name in sys.modules if name.split(".")[0] == "v2hdm"))
+print(*sys.modules)
 """
 
 
-def test_mapping_loads_no_writer_no_page_no_mosaic_and_no_renderer():
+def test_mapping_loads_no_writer_no_page_no_mosaic_no_renderer_and_no_statistics():
     process = subprocess.run(
         [sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
     )
@@ -334,6 +334,7 @@ def test_mapping_loads_no_writer_no_page_no_mosaic_and_no_renderer():
     unneeded = "io.maps.formats io.calibration.writing io.importers.bag report.page report.photos mosaic"
     for name in (*unneeded.split(), "simulate.render"):
         assert not [module for module in modules if f"{module}.".startswith(f"v2hdm.{name}.")], name
+    assert "scipy.stats" not in modules
 
 
 @pytest.mark.parametrize(

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
-from scipy.stats import norm
 
 from v2hdm.association.sightings import row_shares
 from v2hdm.catalogue import AREA, SHIPPED
+from v2hdm.densities import log_normal_density
 from v2hdm.detection.batch import read_grey
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.geometry.ipm import project_ground
@@ -326,10 +326,10 @@ def _states(views: Sequence[_View], outlines: int) -> IntArray:
     expected, sigma = _expected(contrast, usual, size, detected)
     is_known = np.isfinite(contrast) & np.isfinite(usual)
     off = np.where(is_known, contrast - expected, 0.0)
-    faint = norm.logpdf(np.where(is_known, contrast - usual / 2, 0.0), 0.0, np.abs(usual) / 3 + sigma)
-    clear = np.log1p(-_FAINT_SHARE) + norm.logpdf(off, 0.0, sigma)
+    faint = log_normal_density(np.where(is_known, contrast - usual / 2, 0.0), 0.0, np.abs(usual) / 3 + sigma)
+    clear = np.log1p(-_FAINT_SHARE) + log_normal_density(off, 0.0, sigma)
     shown = logsumexp([clear, np.log(_FAINT_SHARE) + faint], axis=0)
-    hidden = norm.logpdf(np.where(is_known, contrast, 0.0), 0.0, HIDDEN_SIGMA)
+    hidden = log_normal_density(np.where(is_known, contrast, 0.0), 0.0, HIDDEN_SIGMA)
     either = np.logaddexp(shown, hidden) + np.log(0.5)
     sides = np.where(is_known[..., None], _ALIKE * np.stack([shown, hidden, either], axis=2), 0.0).sum(axis=1)
     share = _PRIOR / _PRIOR.sum()

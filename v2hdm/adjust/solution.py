@@ -9,7 +9,7 @@ from enum import Enum, IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from v2hdm.adjust.covariance import Covariance, Dropped
 from v2hdm.adjust.model import state_residual
@@ -43,7 +43,8 @@ def noise_scale(mahalanobis2: FloatArray) -> float:
 
 def as_of_point(squared_of_line: FloatArray) -> FloatArray:
     """Squared residuals of lines, chi-square with one degree of freedom, as equally likely ones of points."""
-    return np.asarray(-2 * chi2.logsf(squared_of_line, 1))
+    with np.errstate(divide="ignore"):  # a probability of 0 is infinitely unlikely
+        return np.asarray(-2 * np.log(chdtrc(1, squared_of_line)))
 
 
 def classify(

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import expit
-from scipy.stats import norm
 
+from v2hdm.densities import log_normal_density
 from v2hdm.errors import MapFileError
 from v2hdm.records import FloatArray
 from v2hdm.safe.pixels import read_pixels
@@ -116,7 +116,7 @@ def _known(contrast: FloatArray) -> FloatArray:
 
 def _log_density(contrast: FloatArray, sample: FloatArray) -> FloatArray:
     """Log density (N,) of contrasts like those of a sample (M,), or of something else."""
-    usual = np.log1p(-_STRANGE_SHARE) + norm.logpdf(contrast, *usual_contrast(sample))
+    usual = np.log1p(-_STRANGE_SHARE) + log_normal_density(contrast, *usual_contrast(sample))
     return np.asarray(
-        np.logaddexp(usual, np.log(_STRANGE_SHARE) + norm.logpdf(contrast, 0.0, _STRANGE_SIGMA))
+        np.logaddexp(usual, np.log(_STRANGE_SHARE) + log_normal_density(contrast, 0.0, _STRANGE_SIGMA))
     )

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from v2hdm.asbuilt.registration import Motion
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -20,7 +20,7 @@ from v2hdm.site.living.map_errors import Errors
 _PAINTED_M = 0.01  # start of the standard deviation, m, of a coordinate of the paint about its design
 _LEAST_PAINTED_M = 0.002  # least of it, m: of a design that was surveyed from the paint
 _MOST_PAINTED_M = 0.02  # largest of it, m: paint that lies worse is off
-_APART = chi2.isf(1e-3, 2)  # squared distance of centres, in sigmas, from which on paint takes no part
+_APART = chdtri(2, 1e-3)  # squared distance of centres, in sigmas, from which on paint takes no part
 _ROUNDS = 10  # of finding what takes no part, which settles within five
 _SIGNIFICANT = 1e-3  # probability, if there were no motion of the whole, of one that is said to be
 _FEWEST = 8  # markings that can tell a motion of the whole
@@ -59,7 +59,7 @@ def find_misfit(built: FloatArray, design: FloatArray, errors: Errors, start: Mo
     whole = Motion(turn_rad, np.asarray(start.shift_m + step[:2]), start.about_map)
     estimate = np.append(whole.shift_m, turn_rad)
     squared = float(estimate @ np.linalg.solve(joint.spread, estimate))
-    probability = float(chi2.sf(squared, 3)) if len(chosen) >= _FEWEST else 1.0
+    probability = float(chdtrc(3, squared)) if len(chosen) >= _FEWEST else 1.0
     if probability >= _SIGNIFICANT:
         off_m = built - design
         motions = motions[:, :, :0]

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from v2hdm.records import FloatArray, Marking
 from v2hdm.report.metrics import corner_errors, first_corners
 from v2hdm.site.relative import neighbours
 
-INSIDE_95 = float(chi2.ppf(0.95, 2))
+INSIDE_95 = float(chdtri(2, 0.05))
 """Squared error, in sigmas, of a corner on the border of its 95 % ellipse."""
 
 

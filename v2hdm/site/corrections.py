@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from v2hdm.geometry.planar import clip_convex, signed_area
 from v2hdm.io.maps.corrections import ACCEPTED, ADDED, REJECTED, Correction, Heard
@@ -17,7 +17,7 @@ _SAME_M = 0.4  # largest distance, m, between a candidate's centre and the one t
 _SURE = float(
     np.log(999.0)
 )  # log odds of a marking, or against it, from which the images contradict a person
-_CONTRADICTS = float(chi2.isf(1e-3, 2))  # squared distance, in sigmas, that one of 1000 right corners exceeds
+_CONTRADICTS = float(chdtri(2, 1e-3))  # squared distance, in sigmas, that one of 1000 right corners exceeds
 _LEAST_PAINT = 0.5  # share of a marking that is painted at least: a worn one, chosen
 _ADDED = "added"  # what the map follows of a marking that a person added
 MAX_OVERLAP = 0.2  # overlap of outlines, relative to the smaller, from which they are one paint

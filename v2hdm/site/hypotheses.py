@@ -16,10 +16,10 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
-from scipy.stats import norm
+from scipy.special import log_ndtr, logsumexp, ndtr
 
 from v2hdm.association.groups import SHAPE_TOLERANCE
+from v2hdm.densities import normal_density
 from v2hdm.geometry.planar import diameters
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.site.candidates import Candidates
@@ -143,7 +143,7 @@ class Hypothesis:
         mean = np.sum(one_sided * solved[..., None], axis=1)
         explained = np.sum(one_sided * np.linalg.solve(innovation, one_sided), axis=1)
         # Two directions are treated as independent: correlation changes the quadrant's probability little.
-        inside = norm.logcdf(mean / np.sqrt(np.maximum(1 - explained, 1e-9))) + np.log(2)
+        inside = log_ndtr(mean / np.sqrt(np.maximum(1 - explained, 1e-9))) + np.log(2)
         return np.asarray(both_ways + inside.sum(axis=1))
 
     def corners(self, paint: PaintError) -> Candidates:
@@ -347,11 +347,11 @@ class Hypotheses:
         squared = weight * np.maximum(off_m**2 - own_m2, 0.0)
         squared_of_others = _REPEATED_COUNT * _LENGTH_SIGMA_M**2 + squared.sum() - squared
         spread_m = np.sqrt(squared_of_others / (_REPEATED_COUNT + weight.sum() - weight))
-        alone = norm.pdf(off_m, 0.0, np.sqrt(own_m2 + spread_m**2))
+        alone = normal_density(off_m, 0.0, np.sqrt(own_m2 + spread_m**2))
         # One whose ends were never seen has any such length, and is no example of a certain one.
         seen_share = spread_m**2 / (spread_m**2 + own_m2)
         sigma_between = np.sqrt(own_m2[:, None] + seen_share * own_m2 + 2 * sigma_m**2)
-        density = norm.pdf(off_m[:, None], seen_share * off_m, sigma_between)
+        density = normal_density(off_m[:, None], seen_share * off_m, sigma_between)
         alike = weight * (1 - np.eye(len(weight))) * density
         drawn = (_REPEATED_COUNT * alone + alike.sum(axis=1)) / (_REPEATED_COUNT + weight.sum() - weight)
         return spread_m, np.asarray(np.log(np.maximum(drawn, 1e-300) / np.maximum(alone, 1e-300)))
@@ -432,7 +432,7 @@ def _deformed(candidates: Candidates, mean_map: FloatArray, tolerance_m: FloatAr
     variance_m2 = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 4, 2).sum(axis=2)
     sigma_m = np.sqrt(np.maximum(variance_m2, 1e-12))
     limit_m = tolerance_m[:, None]
-    beyond = norm.sf((limit_m - off_m) / sigma_m) + norm.sf((limit_m + off_m) / sigma_m)
+    beyond = ndtr((off_m - limit_m) / sigma_m) + ndtr(-(off_m + limit_m) / sigma_m)
     return np.asarray(beyond.max(axis=1))
 
 
@@ -471,8 +471,8 @@ def _worn_evidence(candidates: Candidates, ends: Sequence[FloatArray], weight: F
     excess = sigma - np.median(sigma[:, weight * whole > 0.5])
     worn_mean, worn_sigma = _WORN_SPREAD
     sound_mean, sound_sigma = _SOUND_SPREAD
-    worn = norm.pdf(excess, worn_mean, worn_sigma)
-    sound = norm.pdf(excess, sound_mean, sound_sigma)
+    worn = normal_density(excess, worn_mean, worn_sigma)
+    sound = normal_density(excess, sound_mean, sound_sigma)
     odds = worn + _CLEAR_SHARE * (sound - worn)
     odds /= sound + _UNCLEAR_SHARE * (worn - sound)
     return np.asarray(np.where(whole, np.log(odds), 0.0))

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
 
+from v2hdm.densities import normal_density
 from v2hdm.records import LANE_DASH, FloatArray
 
 STANDARD_M: Mapping[str, tuple[float, ...]] = {LANE_DASH: (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)}
@@ -49,7 +49,7 @@ def lost_of(standard_m: tuple[float, ...], length_m: FloatArray, sigma_m: FloatA
     by_standards = _density(standard_m, grid_m)
     is_known = np.isfinite(sigma_m)
     width_m = np.hypot(_LAID_OUT * length_m, np.where(is_known, sigma_m, 1.0))
-    by_dash = norm.pdf(grid_m, length_m[:, None], width_m[:, None]) * is_known[:, None]
+    by_dash = normal_density(grid_m, length_m[:, None], width_m[:, None]) * is_known[:, None]
     others = is_known.sum() - is_known
     by_others = by_dash.sum(axis=0) - by_dash
     density = (_STANDARDS_COUNT * by_standards + by_others) / (_STANDARDS_COUNT + others)[:, None]
@@ -67,7 +67,7 @@ def lost_of(standard_m: tuple[float, ...], length_m: FloatArray, sigma_m: FloatA
 def _density(standard_m: tuple[float, ...], grid_m: FloatArray) -> FloatArray:
     """Density (K,) of painted lengths at ``grid_m`` (K,), by standards and other habits."""
     log_m = np.log(grid_m)
-    standards = [norm.pdf(log_m, np.log(length_m), _LAID_OUT) for length_m in standard_m]
+    standards = [normal_density(log_m, np.log(length_m), _LAID_OUT) for length_m in standard_m]
     of_standards = np.mean(standards, axis=0)
-    of_others = norm.pdf(log_m, np.log(_OTHER_M), _OTHER_SPREAD)
+    of_others = normal_density(log_m, np.log(_OTHER_M), _OTHER_SPREAD)
     return np.asarray((_STANDARD_SHARE * of_standards + (1 - _STANDARD_SHARE) * of_others) / grid_m)

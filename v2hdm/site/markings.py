@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import beta, f
+from scipy.special import betainc, fdtrc
 
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import Quad
@@ -218,12 +218,12 @@ def most_suspicious(
     # With an inverse-gamma prior, the variance follows Fisher's F distribution.
     variance = np.nan_to_num(squared[accepted], nan=1e9) / freedom
     scale, prior = variance_prior(variance, freedom)
-    residuals = f.sf(variance / scale, freedom, prior)
+    residuals = fdtrc(freedom, prior, variance / scale)
     # Binomial tail, continued to fractions of an image.
     rate = (observations - agreed).sum() / max(observations.sum(), 1)
     disputes = (observations - agreed) / CORNERS_OF_IMAGE
     images = observations / CORNERS_OF_IMAGE
-    sightings = np.where(disputes > 0, beta.cdf(rate, np.maximum(disputes, 1e-9), images - disputes + 1), 1.0)
+    sightings = np.where(disputes > 0, betainc(np.maximum(disputes, 1e-9), images - disputes + 1, rate), 1.0)
     rows = zip(
         misfit[accepted],
         residuals,

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import betaln, expit, logsumexp
-from scipy.stats import f, norm, t
+from scipy.special import betaln, expit, fdtrc, logsumexp
 
+from v2hdm.densities import log_normal_density, log_student_density
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates, Counts
 from v2hdm.site.hypotheses import Hypotheses, Kind
@@ -154,7 +154,7 @@ def _of_class(
         if hypothesis.kind in (Kind.OF_CLASS, Kind.OTHER_LENGTH)
     ]
     # Paint errors follow Student's t distribution, their squares Fisher's F.
-    misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
+    misfit = fdtrc(5, paint.freedom, np.min(like_others, axis=0) / 5) if shapes else np.ones(len(candidates))
     mixture = space.mixture(joint, paint)
     return Posterior(probability, log_odds, mixture.candidates, evidence, misfit, mixture.deformed)
 
@@ -183,7 +183,7 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     is_in_images = counts.images > 0
     alike = _log_like_class(counts.log_odds, weight * is_in_images)
     other_mean, other_sigma = _OTHER_ODDS
-    unlike = norm.logpdf(counts.log_odds, other_mean, other_sigma)
+    unlike = log_normal_density(counts.log_odds, other_mean, other_sigma)
     # The shaft of an arrow looks like a dash; most other clutter like no known class.
     either = np.logaddexp(alike, unlike) - np.log(2)
     looks = np.stack([alike, either, unlike], axis=1) * is_in_images[:, None]
@@ -248,7 +248,7 @@ def _log_like_class(odds: FloatArray, weight: FloatArray) -> FloatArray:
     mean = (usual / sigma**2 + weight @ odds / least) / information
     spread = weight @ (odds - mean) ** 2 * (1 - 2 / _ODDS_FREEDOM) / max(total, 1.0)
     scale = np.sqrt(max(least, float(spread)) + 1 / information)
-    return np.asarray(t.logpdf(odds, _ODDS_FREEDOM, mean, scale))
+    return log_student_density(odds, _ODDS_FREEDOM, mean, scale)
 
 
 def _geometric(images: IntArray, stay: float) -> FloatArray:

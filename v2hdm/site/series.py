@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import norm
+from scipy.special import ndtri
 
+from v2hdm.densities import normal_density
 from v2hdm.geometry.planar import cross
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.site.candidates import Candidates
@@ -48,7 +49,8 @@ class Series:
         """Log-likelihood ratio (N,) of a marking's ``corners`` against any position along its line."""
         off_m = _times(self.middle, corners) - self.middle_m
         sigma_m = np.sqrt(self.middle_sigma_m**2 + corners.along(self.middle, self.middle))
-        ratio = norm.pdf(np.nan_to_num(off_m), 0.0, sigma_m) * np.where(np.isnan(off_m), 1.0, self.apart_m)
+        apart_m = np.where(np.isnan(off_m), 1.0, self.apart_m)
+        ratio = normal_density(np.nan_to_num(off_m), 0.0, sigma_m) * apart_m
         log_ratio = np.log(self.middle_often * ratio + 1 - self.middle_often)
         return np.asarray(np.where(np.isnan(off_m), 0.0, log_ratio))
 
@@ -89,7 +91,7 @@ def in_series(
     trust = np.where(in_line, most_m2 / (most_m2 + unknown_m2), 0.0)
     longer_m = length_m * trust * np.where(in_line, stretch - 1, 0.0)
     longer_m2 = np.where(in_line, trust * unknown_m2, 0.0)
-    fixed = norm.pdf(own_m[regular], 0.0, np.sqrt(variance[regular]))
+    fixed = normal_density(own_m[regular], 0.0, np.sqrt(variance[regular]))
     spread_m, often = _regularity((own_m - longer_m)[regular], (variance + longer_m2)[regular], fixed)
     longer_sigma_m = np.where(in_line, np.sqrt(longer_m2 + spread_m**2), 0.0)
     enclosed = regular & np.isfinite(spacing.off_m)
@@ -185,9 +187,9 @@ def _regularity(off_m: FloatArray, variance: FloatArray, otherwise: FloatArray) 
     ``off_m`` (N,) are deviations, ``otherwise`` (N,) their density for dashes that do not follow.
     """
     # Dashes that scatter more than markings of a class form no series.
-    spread_m = min(float(np.median(np.abs(off_m)) / norm.ppf(0.75)), MEMBER_M)
+    spread_m = min(float(np.median(np.abs(off_m)) / ndtri(0.75)), MEMBER_M)
     often = 0.5
-    series = norm.pdf(off_m, 0.0, np.sqrt(variance + spread_m**2))
+    series = normal_density(off_m, 0.0, np.sqrt(variance + spread_m**2))
     for _ in range(_PASSES):
         mixture = often * series + (1 - often) * otherwise
         often = float((1 + np.sum(often * series / np.maximum(mixture, 1e-300))) / (2 + len(off_m)))

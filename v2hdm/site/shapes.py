@@ -22,8 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
-from scipy.special import gammaln
-from scipy.stats import chi2
+from scipy.special import chdtri, gammaln
 
 from v2hdm.geometry.planar import turned_left
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -258,7 +257,7 @@ def _deviations(shape: FloatArray, sigma_m: float, candidates: Candidates) -> _D
 def _spread_m(shape: FloatArray, candidates: Candidates) -> tuple[float, float]:
     """Scatter of members' corners about their shape net of their covariances, and by these, by medians."""
     _, off, formal = _deviations(shape, SHAPE_SIGMA_M, candidates)
-    expected = float(chi2.median(off.shape[1]))
+    expected = float(chdtri(off.shape[1], 0.5))
     low = SHAPE_SIGMA_M
     high = float(np.abs(off).max()) + SHAPE_SIGMA_M
     for _ in range(20):

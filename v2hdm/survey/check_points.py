@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from v2hdm.io.maps.features import features_of
 from v2hdm.records import FloatArray, HDMap, JointCovariance
@@ -68,7 +68,7 @@ class CheckedPoint:
     @property
     def is_inside(self) -> bool:
         """Whether it is inside its 95 % ellipse."""
-        return bool(self.normalised**2 <= chi2.ppf(INSIDE, 2))
+        return bool(self.normalised**2 <= chdtri(2, 1 - INSIDE))
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class CheckTable:
             "chi_square": self.squared,
             "degrees_of_freedom": degrees,
             "nees": self.squared / degrees,
-            "probability": float(chi2.sf(self.squared, degrees)),
+            "probability": float(chdtrc(degrees, self.squared)),
             "height": {
                 "compared": len(heights_m),
                 "mean_z_m": float(np.mean(heights_m)),

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from v2hdm.errors import MappingError
 from v2hdm.faults import Contradiction, Item, Recovery
@@ -66,7 +66,7 @@ def _mean(tests: Sequence[Contradiction]) -> Contradiction:
         value=mean,
         sigma=sigma,
         model_sigma=of_model,
-        p_value=2 * float(norm.sf(abs(mean) / sigma)),
+        p_value=2 * float(ndtr(-abs(mean) / sigma)),
         gain=gain,
     )
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import logsumexp
-from scipy.stats import norm
 
 from v2hdm.association.ground import Views, easy_views, locate
 from v2hdm.association.groups import near_pairs, squared_distances
 from v2hdm.association.sightings import Rig, Sightings, row_shares
+from v2hdm.densities import log_normal_density
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
@@ -49,15 +49,15 @@ class Paint:
     def log_painted(self, contrast: FloatArray) -> FloatArray:
         """Log density (N,) of contrasts at undetected markings: worn, or hidden."""
         mean, sigma = self.painted
-        worn = norm.logpdf(contrast, mean / 2, abs(mean) / 3 + sigma)
-        hidden = norm.logpdf(contrast, 0.0, HIDDEN_SIGMA)
+        worn = log_normal_density(contrast, mean / 2, abs(mean) / 3 + sigma)
+        hidden = log_normal_density(contrast, 0.0, HIDDEN_SIGMA)
         return _mixed(hidden, worn, _HIDDEN_SHARE)
 
     def log_bare(self, contrast: FloatArray) -> FloatArray:
         """Log density (N,) of contrasts of bare ground."""
         mean, sigma = self.bare
-        strange = norm.logpdf(contrast, 0.0, HIDDEN_SIGMA)
-        return _mixed(strange, norm.logpdf(contrast, mean, sigma), _STRANGE_SHARE)
+        strange = log_normal_density(contrast, 0.0, HIDDEN_SIGMA)
+        return _mixed(strange, log_normal_density(contrast, mean, sigma), _STRANGE_SHARE)
 
 
 def _mixed(first: FloatArray, second: FloatArray, share: float) -> FloatArray:

@@ -18,8 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.stats import norm
+from scipy.special import ndtr
 
+from v2hdm.densities import log_normal_density, normal_density
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import Quad
@@ -107,9 +108,9 @@ class Cells:
         lit_like = lit_like[..., ::step]
         paint = _CONTRASTS[:, None]
         sigma = np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]
-        partly = norm.cdf(cells, 0.0, _GROUND_SIGMA) - norm.cdf(cells, paint, sigma)
-        bare = np.broadcast_to(norm.pdf(cells, 0.0, _GROUND_SIGMA), partly.shape)
-        by_side = np.stack([norm.pdf(cells, paint, sigma), bare, np.maximum(partly, 0.0) / paint])
+        partly = ndtr(cells / _GROUND_SIGMA) - ndtr((cells - paint) / sigma)
+        bare = np.broadcast_to(normal_density(cells, 0.0, _GROUND_SIGMA), partly.shape)
+        by_side = np.stack([normal_density(cells, paint, sigma), bare, np.maximum(partly, 0.0) / paint])
         densities = (by_side * lit_like).sum(axis=1) + 1e-6
         cells = (cells * lit_like).sum(axis=0)
         weight = np.broadcast_to(np.array([0.6, 0.2, 0.2])[:, None, None], (3, len(paint), 1))
@@ -175,7 +176,7 @@ def _shares(fits: Sequence[Fit], kinds: Sequence[str]) -> list[PaintLeft]:
         middle = _USUAL_LOG_CONTRAST
         spread = _USUAL_SPREAD
         for _ in range(3):
-            log_posterior = likelihood + norm.logpdf(log_contrasts, middle, spread)
+            log_posterior = likelihood + log_normal_density(log_contrasts, middle, spread)
             posterior = np.exp(log_posterior - log_posterior.max(axis=1, keepdims=True))
             posterior /= posterior.sum(axis=1, keepdims=True)
             log_contrast = posterior @ log_contrasts

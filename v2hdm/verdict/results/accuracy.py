@@ -14,7 +14,7 @@ from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from v2hdm.faults import Contradiction, table
 from v2hdm.faults.odds import CLEAR_SIGMAS
@@ -333,7 +333,7 @@ def _ratio(value: float, degrees: int) -> float:
 
 
 def _limit(degrees: int) -> float:
-    return _ratio(float(chi2.isf(SIGNIFICANCE, degrees)), degrees)
+    return _ratio(float(chdtri(degrees, SIGNIFICANCE)), degrees)
 
 
 def check_known_sizes(sizes: SizeOptions, best: MethodResult) -> list[Finding]:

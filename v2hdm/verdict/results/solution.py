@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.special import betaln, logsumexp
-from scipy.stats import beta
 
+from v2hdm.densities import log_beta_density
 from v2hdm.faults import Contradiction, Fault, table
 from v2hdm.faults.odds import (
     CLEAR_SIGMAS,
@@ -397,7 +397,8 @@ def _rejected_odds(fit: CameraFit) -> float:
         mixed = np.logaddexp(np.log1p(-other) + of_marking, np.log(other) + of_other)
     along = mixed.sum(axis=1) + np.log(np.gradient(_SHARES))
     wrong, right = (
-        logsumexp(along + beta.logpdf(_SHARES, a, b)) for a, b in (_REJECTED_OF_WRONG, _REJECTED_OF_RIGHT)
+        logsumexp(along + log_beta_density(_SHARES, a, b))
+        for a, b in (_REJECTED_OF_WRONG, _REJECTED_OF_RIGHT)
     )
     return float(wrong - right)
 
