@@ -4,15 +4,17 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 
 from tests.ports import TINY_ROUTE, short_port, small_port
+from v2hdm.detection.batch import read_image
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.pipeline.base import grey_reader
 from v2hdm.records import Calibration, HDMap, PaintLeft
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import PaintConfig, RouteConfig
 from v2hdm.simulate.render import ground
+from v2hdm.site.living import wear
 from v2hdm.site.living.wear import Footage, with_wear
 
 FOOTPRINT_M = 0.012  # of a pixel of the nearest images, at which the renderer draws the flakes
@@ -39,6 +41,10 @@ def share_rendered(paint):
     return float(opacity[inside].mean())
 
 
+def reader(drive):
+    return lambda image: read_image(image, drive.cameras[image.camera])
+
+
 def measured(folder, port, earlier=None):
     """(map, rendered shares by marking) under the true geometry: markings that half the images show whole."""
     drive = read_drive(folder)
@@ -53,9 +59,9 @@ def measured(folder, port, earlier=None):
     paints = build_port(port).renderer.scene.paints
     centres = np.array([paint.polygon_map.mean(axis=0) for paint in paints])
     nearest = [np.argmin(((centres - m.corners_map.mean(axis=0)) ** 2).sum(axis=1)) for m in markings]
-    poses, grey = truth.map_from_vehicle, grey_reader(drive)
+    poses = truth.map_from_vehicle
     footage = Footage(drive.images, poses, calibrations, None)
-    hd_map = with_wear(HDMap(tuple(markings)), footage, grey, shown, earlier)
+    hd_map = with_wear(HDMap(tuple(markings)), footage, reader(drive), shown, earlier)
     return hd_map, {m.id: share_rendered(paints[k]) for m, k in zip(markings, nearest, strict=True)}
 
 
@@ -108,7 +114,16 @@ def test_a_marking_that_no_image_shows_keeps_what_the_earlier_map_says(small_dri
     away = replace(read_truth(drive).map.markings[0], corners_map=np.eye(4)[:, :2] + 1e4, id=1)
     before = HDMap((replace(away, paint=PaintLeft(0.7, 0.1)),))
     footage = Footage(drive.images, [image.map_from_vehicle for image in drive.images], {}, None)
-    grey = grey_reader(drive)
-    updated = with_wear(HDMap((away,)), footage, grey, set(), before)
+    updated = with_wear(HDMap((away,)), footage, reader(drive), set(), before)
     assert updated.markings[0].paint == PaintLeft(0.7, 0.1)
-    assert with_wear(HDMap((away,)), footage, grey, set()).markings[0].paint is None
+    assert with_wear(HDMap((away,)), footage, reader(drive), set()).markings[0].paint is None
+
+
+@pytest.mark.parametrize("corner_px", [(4.3, 7.8), (-0.6, 9.0), (51.0, 37.5)])
+def test_the_light_at_a_place_is_that_of_the_whole_image(corner_px):
+    rng = np.random.default_rng(3)
+    pixels = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    px = corner_px + rng.uniform(0.0, 12.5, (7, 5, 2))
+    whole = cv2.LUT((pixels.sum(axis=2) // 3).astype(np.uint8), wear._LIGHT)
+    expected = cv2.remap(whole, *np.moveaxis(px.astype(np.float32), 2, 0), cv2.INTER_LINEAR)
+    assert np.array_equal(wear._light_at(px, pixels), expected)

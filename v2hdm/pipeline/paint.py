@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from v2hdm.detection.batch import read_image
 from v2hdm.io.maps.corrections import Correction
 from v2hdm.mapping.results import MethodResult
-from v2hdm.pipeline.base import grey_reader
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.stages import MappedSet
 from v2hdm.records import BEST, TEXT, Drive, HDMap, Image
@@ -70,9 +69,7 @@ def _with_wear(
     # Nothing was detected of what a person added: every image may show it.
     unseen = [number for number, marking in enumerate(best.hd_map.markings) if not marking.sightings]
     shown |= {(image, number) for image in range(len(drive.images)) for number in unseen}
-    grey = grey_reader(drive)
-    assert grey is not None
-    return with_wear(best.hd_map, footage, grey, shown, before, context.threads)
+    return with_wear(best.hd_map, footage, _colours(drive), shown, before, context.threads)
 
 
 def _with_words(hd_map: HDMap, footage: Footage, drive: Drive, context: Context) -> HDMap:
@@ -85,6 +82,11 @@ def _with_words(hd_map: HDMap, footage: Footage, drive: Drive, context: Context)
         _log.warning("%s", MISSING)
         return hd_map
     return with_readings(hd_map, footage, drive.cameras, _light(drive), recogniser, context.threads)
+
+
+def _colours(drive: Drive) -> Callable[[Image], NDArray[np.uint8]]:
+    """Reads the colours (H, W, 3) of an image."""
+    return lambda image: read_image(image, drive.cameras[image.camera])
 
 
 def _light(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -109,14 +108,9 @@ def patches_of(
     for number, views_of_word in enumerate(views):
         for index in views_of_word:
             words_of_image.setdefault(index, []).append(number)
-    order = sorted(words_of_image)
-    with ThreadPoolExecutor(threads) as readers:
-        for start in range(0, len(order), 8 * threads):  # limits the decoded images in memory
-            batch = order[start : start + 8 * threads]
-            lights = readers.map(lambda index_to_read: light(footage.images[index_to_read]), batch)
-            for index, pixels in zip(batch, lights, strict=True):
-                for number in words_of_image[index]:
-                    yield Patch(number, index, _cut(words[number], footage, index, pixels))
+    for index, pixels in footage.read(sorted(words_of_image), light, threads):
+        for number in words_of_image[index]:
+            yield Patch(number, index, _cut(words[number], footage, index, pixels))
 
 
 def _cut(word: Word, footage: Footage, index: int, pixels: NDArray[np.float32]) -> list[Grey]:

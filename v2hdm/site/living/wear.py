@@ -9,8 +9,9 @@ dirt dims whole paint.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -42,6 +43,7 @@ _INDEPENDENT = 12.0  # cells that count as independent: flakes, stains and the b
 _CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))
 """Contrasts of full paint over its ground that are tested."""
 
+_AHEAD = 4  # most images that a thread reads ahead, which lie in the memory; chosen
 _ROUNDS = 12  # rounds of expectation maximisation
 _FITTED = 160  # most cells of a marking that take part in the fit
 
@@ -137,18 +139,19 @@ def _shares_of_side(side_m: float, least: int, most: int) -> FloatArray:
 def with_wear(
     hd_map: HDMap,
     footage: Footage,
-    grey: Callable[[Image], NDArray[np.float32]],
+    colours: Callable[[Image], NDArray[np.uint8]],
     shown: Set[tuple[int, int]],
     earlier: HDMap | None = None,
     threads: int = 1,
 ) -> HDMap:
     """``hd_map`` with the fraction of paint left of each marking that two or more images show near.
 
-    ``grey`` reads an image of the ``footage`` (H, W); ``shown`` are (image, marking) pairs without occlusion.
+    ``colours`` reads an image (H, W, 3) of the ``footage``; ``shown`` are (image, marking) pairs without
+    occlusion.
     A marking of the ``earlier`` map with the same id states the change, and keeps its value if unseen here.
     """
     cells = [Cells.of(marking.corners_map) for marking in hd_map.markings]
-    for number, light in _lights(cells, footage, _best_views(cells, footage, shown), grey, threads):
+    for number, light in _lights(cells, footage, _best_views(cells, footage, shown), colours, threads):
         cells[number].add(light)
     measured = [k for k, cells_of_marking in enumerate(cells) if len(cells_of_marking.contrasts) >= _VIEWS[0]]
     shares = _shares([cells[k].fit() for k in measured], [hd_map.markings[k].kind for k in measured])
@@ -208,6 +211,17 @@ class Footage:
     calibrations: Mapping[str, Calibration]
     ground: Surface | None
 
+    def read(
+        self, indices: Sequence[int], pixels_of: Callable[[Image], np.ndarray], threads: int
+    ) -> Iterator[tuple[int, np.ndarray]]:
+        """Indices and pixels of these images, in order; threads read a few ahead."""
+        with ThreadPoolExecutor(threads) as readers:
+            coming: deque[Future[np.ndarray]] = deque()
+            for number, index in enumerate(indices):
+                for index_ahead in indices[number + len(coming) : number + _AHEAD * threads]:
+                    coming.append(readers.submit(pixels_of, self.images[index_ahead]))
+                yield index, coming.popleft().result()
+
     def pinhole_px(self, index: int, places_map: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pinhole px (N, 2) and depth (N,), m, of ground points (N, 2) in an image."""
         calibration = self.calibrations[self.images[index].camera]
@@ -253,21 +267,25 @@ def _lights(
     cells: Sequence[Cells],
     footage: Footage,
     markings_of_image: Mapping[int, Sequence[int]],
-    grey: Callable[[Image], NDArray[np.float32]],
+    colours: Callable[[Image], NDArray[np.uint8]],
     threads: int,
 ) -> Iterator[tuple[int, FloatArray]]:
     """Each wanted marking of each image, and the light of its cells (along, across) there."""
-    order = sorted(markings_of_image)
-    with ThreadPoolExecutor(threads) as readers:
-        for start in range(0, len(order), 8 * threads):  # limits the decoded images in memory
-            batch = order[start : start + 8 * threads]
-            greys = readers.map(lambda index_to_read: grey(footage.images[index_to_read]), batch)
-            for index, pixels in zip(batch, greys, strict=True):
-                info = footage.calibrations[footage.images[index].camera].info
-                light = cv2.LUT(pixels.astype(np.uint8), _LIGHT)
-                for number in markings_of_image[index]:
-                    places_map = cells[number].places_map
-                    px = distort_points(info, footage.pinhole_px(index, places_map.reshape(-1, 2))[0])
-                    places_px = px.reshape(places_map.shape).astype(np.float32)
-                    light_of_cells = cv2.remap(light, places_px[..., 0], places_px[..., 1], cv2.INTER_LINEAR)
-                    yield number, np.asarray(light_of_cells, dtype=np.float64)
+    for index, pixels in footage.read(sorted(markings_of_image), colours, threads):
+        info = footage.calibrations[footage.images[index].camera].info
+        for number in markings_of_image[index]:
+            places_map = cells[number].places_map
+            px = distort_points(info, footage.pinhole_px(index, places_map.reshape(-1, 2))[0])
+            yield number, _light_at(px.reshape(places_map.shape), pixels)
+
+
+def _light_at(px: FloatArray, pixels: NDArray[np.uint8]) -> FloatArray:
+    """Light (along, across) at px (along, across, 2) of an image (H, W, 3)."""
+    # The few pixels around a marking alone are converted, not the whole image.
+    first = np.clip(np.floor(px.min(axis=(0, 1))), 0, None).astype(np.intp)
+    last = np.ceil(px.max(axis=(0, 1))).astype(np.intp)
+    around = pixels[first[1] : last[1] + 1, first[0] : last[0] + 1]
+    blue, green, red = np.moveaxis(around.astype(np.uint16), 2, 0)
+    light = _LIGHT[(blue + green + red) // 3]
+    x, y = np.moveaxis(px.astype(np.float32) - first.astype(np.float32), 2, 0)
+    return np.asarray(cv2.remap(light, x, y, cv2.INTER_LINEAR), dtype=np.float64)
