@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypedDict
 
@@ -77,14 +79,18 @@ def pictures(facts: Facts, most_bytes: int) -> dict[str, list[dict[str, Any]]]:
     by_image: dict[str, list[Cut]] = {}
     for cut in sorted(cuts, key=lambda cut: cut.rank)[: most_bytes // _USUAL_BYTES]:
         by_image.setdefault(cut.image, []).append(cut)
-    drawn: list[tuple[Cut, dict[str, Any]]] = []
-    for name, cuts_of_image in by_image.items():
-        image = images[name]
-        pixels = read_image(image, facts.drive.cameras[image.camera])
-        for cut in cuts_of_image:
-            picture = cut_out(pixels, facts, image, cam_from_map[cut.row], cut)
-            if picture is not None:
-                drawn.append((cut, {**picture, "image": name}))
+    cameras = facts.drive.cameras
+
+    def drawn_from(name: str) -> list[tuple[Cut, dict[str, Any]]]:
+        """The pictures that an image gives."""
+        pixels = read_image(images[name], cameras[images[name].camera])
+        cut_outs = [
+            (cut, cut_out(pixels, facts, images[name], cam_from_map[cut.row], cut)) for cut in by_image[name]
+        ]
+        return [(cut, {**picture, "image": name}) for cut, picture in cut_outs if picture is not None]
+
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        drawn = [pair for pairs in threads.map(drawn_from, by_image) for pair in pairs]
     # The best picture of every feature first, then the second best, up to the limit.
     out: dict[str, list[dict[str, Any]]] = {}
     spent = 0
