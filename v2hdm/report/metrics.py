@@ -133,12 +133,8 @@ def match_markings(
 
 def corner_errors(mapped: Sequence[Marking], true: Sequence[Marking]) -> FloatArray:
     """Error vectors (4 M, 2) of paired markings, over the best of the four cyclic corner orders."""
-    pairs = zip(mapped, true, first_corners(mapped, true), strict=True)
-    errors = [
-        np.roll(marking.corners_map, shift, axis=0) - counterpart.corners_map
-        for marking, counterpart, shift in pairs
-    ]
-    return np.concatenate(errors) if errors else np.empty((0, 2))
+    errors = _errors_by_order(mapped, true)
+    return np.asarray(errors[np.arange(len(errors)), _nearest(errors)].reshape(-1, 2))
 
 
 def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[str, float]:
@@ -157,11 +153,22 @@ def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[s
 
 def first_corners(mapped: Sequence[Marking], true: Sequence[Marking]) -> list[int]:
     """The steps to roll each mapped marking's corners by so that they come nearest to the true ones."""
-    shifts = []
-    for marking, counterpart in zip(mapped, true, strict=True):
-        errors = [np.roll(marking.corners_map, s, axis=0) - counterpart.corners_map for s in range(4)]
-        shifts.append(int(np.argmin([(error**2).sum() for error in errors])))
-    return shifts
+    return [int(steps) for steps in _nearest(_errors_by_order(mapped, true))]
+
+
+def _errors_by_order(mapped: Sequence[Marking], true: Sequence[Marking]) -> FloatArray:
+    """Error vectors (M, 4, 4, 2) of the corners of M pairs, by the steps that the mapped ones are rolled."""
+    corners, true_corners = (
+        np.array([marking.corners_map for marking in markings]).reshape(-1, 4, 2)
+        for markings in (mapped, true)
+    )
+    rolled = np.stack([np.roll(corners, steps, axis=1) for steps in range(4)], axis=1)
+    return np.asarray(rolled - true_corners[:, None])
+
+
+def _nearest(errors: FloatArray) -> IntArray:
+    """The steps (M,) of the smallest of errors (M, 4, 4, 2)."""
+    return np.asarray((errors.reshape(-1, 4, 8) ** 2).sum(axis=2).argmin(axis=1))
 
 
 def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: FloatArray) -> dict[str, float]:
