@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,9 +124,8 @@ def _is_sound(numbers: Sequence[float], taken_s: float) -> bool:
     marking, corner = numbers[:2]
     is_whole = 0 <= marking <= _LARGEST_ID and marking.is_integer() and corner in (1, 2, 3, 4)
     # A corner behind the camera has a place in the image, and no finite residual.
-    residuals = np.abs(numbers[5:])
-    is_residual = (residuals <= _LARGEST) | ~np.isfinite(residuals)
-    return is_whole and bool(np.abs([*numbers[2:5], taken_s]).max() <= _LARGEST and is_residual.all())
+    is_residual = all(abs(number) <= _LARGEST or not math.isfinite(number) for number in numbers[5:])
+    return is_whole and is_residual and all(abs(number) <= _LARGEST for number in (*numbers[2:5], taken_s))
 
 
 def write_exclusions(
