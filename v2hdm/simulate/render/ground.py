@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -26,7 +27,6 @@ from v2hdm.simulate.render.scene import (
     noise_tile,
     sample,
     scale_of,
-    smoothstep,
 )  # fmt: skip
 from v2hdm.simulate.render.view import (
     NEAR_M,
@@ -75,19 +75,23 @@ def intersect_ground(view: View) -> GroundField | None:
     info = view.rays.info
     map_from_ray = view.cam_from_map[:3, :3].T @ np.linalg.inv(info.intrinsic)
     centre = view.centre_map
-    inverse_depth = _plane(view, -map_from_ray[2] / centre[2], slice(0, None))
-    below = inverse_depth > np.float32(1.0 / _FARTHEST_M)
-    ground_rows = np.flatnonzero(below.any(axis=1))
-    if len(ground_rows) == 0:
-        return None
-    first = int(ground_rows[0])
-    rows = slice(first, None)
-    depth = np.reciprocal(np.maximum(inverse_depth[rows], np.float32(1.0 / _FARTHEST_M)))
-    x = _plane(view, map_from_ray[0], rows) * depth + np.float32(centre[0])
-    y = _plane(view, map_from_ray[1], rows) * depth + np.float32(centre[1])
-    footprint = depth * depth * np.float32(1.0 / (info.intrinsic[1, 1] * centre[2]))
+    by_pixel = np.stack([map_from_ray[0], map_from_ray[1], -map_from_ray[2] / centre[2]])
     rays = view.rays.u_pinhole_px, view.rays.v_pinhole_px
-    return GroundField(first, x, y, depth, footprint, below[rows], rays)
+    below = np.empty(rays[0].shape, dtype=np.bool_)
+    planes = tuple(np.empty_like(rays[0]) for _ in range(4))
+    least = np.float32(1.0 / _FARTHEST_M)
+    per_focal = np.float32(1.0 / (info.intrinsic[1, 1] * centre[2]))
+    first = kernels.meet_plane(rays, float32s(by_pixel), float32s(centre), least, per_focal, planes, below)
+    if first < 0:
+        return None
+    x, y, depth, footprint = (plane[first:] for plane in planes)
+    return GroundField(first, x, y, depth, footprint, below[first:], rays)
+
+
+def float32s(values: FloatArray) -> Any:
+    """Values as tuples of float32, which kernels read faster than an array: none of them can change."""
+    rounded = values.astype(np.float32)
+    return tuple(rounded) if values.ndim == 1 else tuple(map(tuple, rounded))
 
 
 def _intersect_relief(view: View, relief: Relief) -> GroundField | None:
@@ -121,13 +125,6 @@ def _intersect_relief(view: View, relief: Relief) -> GroundField | None:
         rays=(u / depth, v / depth),
         slope=(by_x, by_y),
     )
-
-
-def _plane(view: View, row: NDArray[np.float64], rows: slice) -> Float32:
-    out = view.rays.u_pinhole_px[rows] * np.float32(row[0])
-    out += view.rays.v_pinhole_px[rows] * np.float32(row[1])
-    out += np.float32(row[2])
-    return out
 
 
 def fine_tile(texture: str | Tile) -> Tile:
@@ -200,13 +197,21 @@ def _marks(marks: GroundMarks, field: GroundField, out: Float32) -> None:
     out *= factor.astype(np.float32) * np.float32(1.0 / 128.0)
 
 
-def wetness(ground: Ground, field: GroundField) -> Float32:
-    """How wet (H, W) the ground is, 0 dry to 1 standing water; of no size when it is dry everywhere."""
+class Wetness(NamedTuple):
+    """Water on the ground: its depth (H, W), of no size where all is dry, and its levels for kernels."""
+
+    depth: Float32
+    levels: tuple[np.float32, np.float32]
+
+
+def wetness(ground: Ground, field: GroundField) -> Wetness:
+    """How wet the ground is; between two levels of depth, dry ground turns to standing water."""
     if ground.wet_fraction <= 0:
-        return np.empty((0, 0), dtype=np.float32)
+        return Wetness(np.empty((0, 0), dtype=np.float32), (np.float32(0), np.float32(0)))
     level = float(np.quantile(WET_TILE.values[::8, ::8], 1.0 - ground.wet_fraction))
-    values = _sample_smooth(WET_TILE, field, texture_shift(ground.seed + 1))
-    return smoothstep(values, level - 0.1, level + 0.3)
+    low = level - 0.1
+    depth = _sample_smooth(WET_TILE, field, texture_shift(ground.seed + 1))
+    return Wetness(depth, (np.float32(low), np.float32(1.0 / (level + 0.3 - low))))
 
 
 def may_cast(box: Box, light: Light, view: View) -> bool:

@@ -331,6 +331,45 @@ def cast_shadow(
 
 
 @exact_kernel
+def meet_plane(
+    rays: Any, by_pixel: Any, centre: Any, least: Any, per_focal: Any, out: Any, below: NDArray[np.bool_]
+) -> int:
+    """Write x and y, depth and footprint (H, W) where rays meet level ground; returns the first row with any.
+
+    ``by_pixel`` are three factors of x and y per depth, and of inverse depth, for pinhole pixels; ``centre``
+    is the camera's. Pixels whose inverse depth is ``least`` or less are not ``below`` (H, W), which alone is
+    written of the rows before the first.
+    """
+    u, v = rays
+    x_m, y_m, depth_m, footprint_m = out
+    first = -1
+    for row in range(below.shape[0]):
+        meets = False
+        for column in range(below.shape[1]):
+            inverse = _along(by_pixel[2], _read(u, row, column), _read(v, row, column))
+            _write(below, row, column, inverse > least)
+            meets |= inverse > least
+        if first < 0 and meets:
+            first = row
+        if first < 0:
+            continue
+        for column in range(below.shape[1]):
+            u_px = _read(u, row, column)
+            v_px = _read(v, row, column)
+            depth = _ONE / max(_along(by_pixel[2], u_px, v_px), least)
+            _write(x_m, row, column, _along(by_pixel[0], u_px, v_px) * depth + centre[0])
+            _write(y_m, row, column, _along(by_pixel[1], u_px, v_px) * depth + centre[1])
+            _write(depth_m, row, column, depth)
+            _write(footprint_m, row, column, depth * depth * per_focal)
+    return first
+
+
+@exactly_inlined
+def _along(factors: Any, u_px: Any, v_px: Any) -> Any:
+    return u_px * factors[0] + v_px * factors[1] + factors[2]
+
+
+@exact_kernel
 def ground_tone(
     tiles: Any, scales: _Plane, amplitudes: _Plane, coarse: _Plane, ground: Any, out: _Plane
 ) -> None:
@@ -401,31 +440,33 @@ def draw_sky(
 
 @exact_kernel
 def light_ground(
-    albedo: _Plane, sun: _Plane, wet: _Plane, ground: Any, centre: _Plane, light: _Plane
+    albedo: _Plane, sun: _Plane, wet: _Plane, wet_levels: Any, ground: Any, centre: Any, light: Any
 ) -> None:
-    """Turn ``albedo`` (H', W, 3) into radiance; ``light`` (3, 3) is of the sun, the sky and the horizon.
+    """Turn ``albedo`` (H', 3 W) into radiance; ``light`` (3 x 3) is of the sun, the sky and the horizon.
 
-    Lambert's law; water, where ``wet`` is not of no size, darkens and mirrors the sky by its angle (after
-    Schlick 1994).
+    Lambert's law; water darkens and mirrors the sky by its angle (after Schlick 1994). It stands by a cubic
+    step over the ``wet_levels``, the lowest and one by their range, of ``wet``, which may be of no size.
     """
     x_m, y_m = ground
+    low, per_range = wet_levels
     squared_height = centre[2] * centre[2]
+    is_wet = wet.shape[0] > 0
     for row in range(albedo.shape[0]):
-        for column in range(albedo.shape[1]):
-            film = mirror = _ZERO
-            if wet.shape[0] > 0:
-                film = wet[row, column]
-                x = x_m[row, column] - centre[0]
-                y = y_m[row, column] - centre[1]
-                sine = centre[2] / _f(np.sqrt(x * x + y * y + squared_height))
-                grazing = _ONE - max(sine, _f(0.12))
-                squared = grazing * grazing
-                mirror = film * (_f(0.02) + _f(0.45) * squared * squared * grazing)
+        for column in range(sun.shape[1]):
+            share = _clip((_read(wet, row, column) - low) * per_range, _ZERO, _ONE) if is_wet else _ZERO
+            film = share * share * (_f(3.0) - _f(2.0) * share)
+            x = _read(x_m, row, column) - centre[0]
+            y = _read(y_m, row, column) - centre[1]
+            sine = centre[2] / _f(np.sqrt(x * x + y * y + squared_height))
+            grazing = _ONE - max(sine, _f(0.12))
+            squared = grazing * grazing
+            mirror = film * (_f(0.02) + _f(0.45) * squared * squared * grazing)
+            clear = _ONE - _f(0.45) * film
+            direct = _read(sun, row, column)
             for c in range(3):
-                lit = albedo[row, column, c] * (sun[row, column] * light[0, c] + light[1, c])
-                if wet.shape[0] > 0:
-                    lit = lit * (_ONE - _f(0.45) * film) + mirror * light[2, c]
-                albedo[row, column, c] = lit
+                place = 3 * column + c
+                lit = albedo[row, place] * (direct * light[0][c] + light[1][c])
+                _write(albedo, row, place, lit * clear + mirror * light[2][c])
 
 
 @exactly_inlined

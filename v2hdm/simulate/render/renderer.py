@@ -325,14 +325,15 @@ class Renderer:
         self._paint.draw(view, ground, albedo, labels)
         sun = on_ground.sun_visibility(shadows, scene.shades, view, ground)
         wet = on_ground.wetness(scene.ground, ground)
-        centre = np.append(view.centre_map[:2], view.height_m).astype(np.float32)
+        centre = on_ground.float32s(np.append(view.centre_map[:2], view.height_m))
         if ground.slope is not None:
             east, north, up = scene.light.sun_direction_map
             sun *= np.maximum(1 - (ground.slope[0] * east + ground.slope[1] * north) / max(up, 0.1), 0)
         light = scene.light
         height = max(light.sun_direction_map[2], 0.0)
-        lights = np.array([[s * height for s in light.sun_bgr], light.sky_bgr, light.horizon_bgr], np.float32)
-        kernels.light_ground(albedo, sun, wet, (ground.x_m, ground.y_m), centre, lights)
+        lights = np.array([[s * height for s in light.sun_bgr], light.sky_bgr, light.horizon_bgr])
+        places = ground.x_m, ground.y_m
+        kernels.light_ground(_rows(albedo), sun, *wet, places, centre, on_ground.float32s(lights))
 
 
 _CODE_STEPS = 16384  # number of levels of linear light that the table of sRGB codes tells apart
