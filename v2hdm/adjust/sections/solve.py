@@ -45,6 +45,7 @@ from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.solve import solve
 from v2hdm.errors import AdjustError, WorkerError
 from v2hdm.executor import HERE, Executor
+from v2hdm.executor.memory import TidyWork
 from v2hdm.records import FloatArray
 
 ROUGH_GAP = 1e-6  # as GAP, where only residuals are asked for: a thousandth of a sigma in most of them
@@ -245,12 +246,12 @@ def finish_parts(
     jobs = [
         Job(part, is_finish=True, gap=joint.gap, rounds=joint.rounds) for part in range(len(joint.net.labels))
     ]
-    return _side_by_side(executor, Work(folder, shape, finish), jobs, progress)
+    return _side_by_side(executor, TidyWork(Work(folder, shape, finish)), jobs, progress)
 
 
 def _side_by_side(
     executor: Executor,
-    work: Work,
+    work: Work | TidyWork,
     jobs: Sequence[Job],
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Any]:

@@ -31,6 +31,7 @@ from v2hdm.adjust.sections.solve import Fitted, Joint, finish_parts, fit_parts, 
 from v2hdm.association.sightings import Sightings, frames_of
 from v2hdm.errors import WorkerError
 from v2hdm.executor import Executor
+from v2hdm.executor.memory import TidyWork
 from v2hdm.faults.clock_errors import second_moments
 from v2hdm.faults.clock_parts import Along, evidence_of
 from v2hdm.faults.sensitivity import stretches_of_way
@@ -150,7 +151,7 @@ class _Run:
         todo = range(self.count) if jobs is None else jobs
         results: dict[int, Any] = {}
         self.progress(step, 0, len(todo))
-        with closing(self.executor.side_by_side(work, todo)) as outcomes:
+        with closing(self.executor.side_by_side(TidyWork(work), todo)) as outcomes:
             for number, outcome in outcomes:
                 if isinstance(outcome, WorkerError):
                     raise WorkerError(f"{step}, section {number + 1} of {self.count}: {outcome}")
