@@ -388,7 +388,7 @@ class _Near(NamedTuple):
 def _near(
     points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: _Pairs, reach_m: tuple[float, float]
 ) -> _Near:
-    """Those of ``pairs`` within ``reach_m``, along and across, of the lines through seeds.
+    """The points of ``pairs`` within ``reach_m``, along and across, of the lines through seeds.
 
     The seeds are at ``points`` (N, 2), and their lines run along ``tangent`` (N, 2).
     """
@@ -463,17 +463,18 @@ def _thin(points: FloatArray, tangent: FloatArray, images: IntArray) -> IntArray
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     pairs = cKDTree(points).query_pairs(_THIN_SPACINGS * NODE_SPACING_M, output_type="ndarray")
-    node, other = np.concatenate([pairs, pairs[:, ::-1]]).T
-    across_m = cross(tangent[node], points[other] - points[node])
-    same = np.abs(np.einsum("pi,pi->p", tangent[node], tangent[other])) >= SAME_DIRECTION
+    node, neighbour = np.concatenate([pairs, pairs[:, ::-1]]).T
+    across_m = cross(tangent[node], points[neighbour] - points[node])
+    same = np.abs(np.einsum("pi,pi->p", tangent[node], tangent[neighbour])) >= SAME_DIRECTION
     same &= np.abs(across_m) <= 0.5 * HALF_WIDTH_M
     node = node[same]
     order = np.argsort(node, kind="stable")
-    others = np.split(other[same][order], np.searchsorted(node[order], np.arange(1, len(points))))
+    ends = np.searchsorted(node[order], np.arange(1, len(points)))
+    neighbours = np.split(neighbour[same][order], ends)
     alive = np.ones(len(points), dtype=bool)
     chosen = []
     for number in np.argsort(-images, kind="stable").tolist():
         if alive[number]:
             chosen.append(number)
-            alive[others[number]] = False
+            alive[neighbours[number]] = False
     return np.array(chosen, dtype=np.int64)
