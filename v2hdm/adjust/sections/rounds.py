@@ -190,7 +190,7 @@ class Work:
         return PartStates(labels, Values.of(place.estimate, border), told)
 
     def _without_information(self, number: int, told: Summary) -> Summary:
-        """A summary whose information is left in a file: some 25 MB, of which few fit in one process."""
+        """A summary whose information is left in a file: some 15 MB for a kilometre."""
         np.save(_information_file(self.folder, number), told.information)
         return replace(told, information=np.zeros((0, 0)))
 
