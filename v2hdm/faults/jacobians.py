@@ -216,9 +216,8 @@ def priors_by_unknowns(arrays: Arrays, estimate: Estimate) -> csr_array:
     frame = of_frame + np.arange(frames * states).reshape(frames, states)
     corner = of_corner + np.arange(sizes[2]).reshape(-1, 2)
     clock = of_clock + np.arange(sizes[3]).reshape(-1, 1)
-    before = np.concatenate(
-        [frame[:1], frame[:-1]]
-    )  # of the first frame, which has none, the derivative is 0
+    # The first frame has none before it: its derivative is 0.
+    before = np.concatenate([frame[:1], frame[:-1]])
     lengths = arrays.lengths
     first = lengths.first.cpu().numpy()
     second = lengths.second.cpu().numpy()
@@ -243,8 +242,8 @@ def _states_by_neighbours(arrays: Arrays) -> Tensor:
     """Derivatives (J, S, 2 S) of the innovations by a frame's states and those of the frame before."""
     by_before = -arrays.state_transition.clone()
     by_before[:1] = 0.0
-    own = torch.eye(by_before.shape[1]).to(by_before).expand_as(by_before)
-    return torch.cat([own, by_before], dim=2) * arrays.state_information_root[..., None]
+    by_frame = torch.eye(by_before.shape[1]).to(by_before).expand_as(by_before)
+    return torch.cat([by_frame, by_before], dim=2) * arrays.state_information_root[..., None]
 
 
 def _controls_by_corner(arrays: Arrays) -> Tensor:

@@ -71,8 +71,8 @@ class Segments:
     @cached_property
     def disagreement(self) -> float:
         """Variance of the segments' scores relative to that under the model's noise."""
-        own, *by_model = self._scatter(np.vstack([self.score, self.drawn])).tolist()
-        return float(own / max(float(np.mean(by_model)), 1e-300))
+        scatter = self._scatter(np.vstack([self.score, self.drawn]))
+        return float(scatter[0] / max(float(np.mean(scatter[1:])), 1e-300))
 
     def _scatter(self, scores: FloatArray) -> FloatArray:
         """Sums (n,) of squared residual scores (n, G + 1), with Bartlett's weights of neighbours."""

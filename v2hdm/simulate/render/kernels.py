@@ -337,8 +337,8 @@ def meet_plane(
     """Write x and y, depth and footprint (H, W) where rays meet level ground; returns the first row with any.
 
     ``by_pixel`` are three factors of x and y per depth, and of inverse depth, for pinhole pixels; ``centre``
-    is the camera's. Pixels whose inverse depth is ``least`` or less are not ``below`` (H, W), which alone is
-    written of the rows before the first.
+    is the camera's. Pixels whose inverse depth is ``least`` or less are not ``below`` (H, W). Of rows before
+    the first one nothing else is written.
     """
     u, v = rays
     x_m, y_m, depth_m, footprint_m = out
@@ -444,8 +444,9 @@ def light_ground(
 ) -> None:
     """Turn ``albedo`` (H', 3 W) into radiance; ``light`` (3 x 3) is of the sun, the sky and the horizon.
 
-    Lambert's law; water darkens and mirrors the sky by its angle (after Schlick 1994). It stands by a cubic
-    step over the ``wet_levels``, the lowest and one by their range, of ``wet``, which may be of no size.
+    Lambert's law; water darkens and mirrors the sky by its angle (after Schlick 1994). Ground is
+    wet by a cubic step of the depth ``wet``, which has no size where all is dry; ``wet_levels`` are the depth
+    at which the step begins and the inverse of its width.
     """
     x_m, y_m = ground
     low, per_range = wet_levels

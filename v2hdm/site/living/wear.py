@@ -43,7 +43,7 @@ _INDEPENDENT = 12.0  # cells that count as independent: flakes, stains and the b
 _CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))
 """Contrasts of full paint over its ground that are tested."""
 
-_AHEAD = 4  # most images that a thread reads ahead, which lie in the memory; chosen
+_AHEAD = 4  # most decoded images in memory for each thread that reads; chosen
 _ROUNDS = 12  # rounds of expectation maximisation
 _FITTED = 160  # most cells of a marking that take part in the fit
 
@@ -147,8 +147,8 @@ def with_wear(
     """``hd_map`` with the fraction of paint left of each marking that two or more images show near.
 
     ``colours`` reads an image (H, W, 3) of the ``footage``; ``shown`` are (image, marking) pairs without
-    occlusion.
-    A marking of the ``earlier`` map with the same id states the change, and keeps its value if unseen here.
+    occlusion. A marking of the ``earlier`` map with the same id states the change, and keeps its value if
+    unseen here.
     """
     cells = [Cells.of(marking.corners_map) for marking in hd_map.markings]
     for number, light in _lights(cells, footage, _best_views(cells, footage, shown), colours, threads):
