@@ -27,7 +27,7 @@ from v2hdm.records import ARROW, FloatArray, Symbol
 from v2hdm.report.metrics import MIN_SIGHTINGS
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.config import PaintConfig, PortConfig, RouteConfig
-from v2hdm.simulate.port.drive import points_seen
+from v2hdm.simulate.port.drive import placed_boxes, points_seen
 
 FOUND_M = 0.5
 CELL_M = 0.005
@@ -72,7 +72,7 @@ def _images(port: Port, points: FloatArray) -> int:
     for frame, pose in enumerate(port.driven.map_from_vehicle):
         for name, camera in port.cameras.items():
             if inside_convex(camera.roi_vehicle, ground_in_vehicle(pose, points)).all():
-                boxes = port.renderer.scene.boxes + port.moving_boxes(frame)
+                boxes = placed_boxes(port.renderer.scene.boxes + port.moving_boxes(frame))
                 is_seen = points_seen(camera.info, port.cam_from_map(name, frame), points, boxes)
                 count += bool(is_seen.all())
     return count

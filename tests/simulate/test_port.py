@@ -25,7 +25,7 @@ from v2hdm.simulate.port.config import (
     RouteConfig,
     StencilConfig,
 )
-from v2hdm.simulate.port.drive import hidden_by, inside_image, points_seen
+from v2hdm.simulate.port.drive import hidden_by, inside_image, placed_boxes, points_seen
 from v2hdm.simulate.port.paint import build_layout
 from v2hdm.simulate.port.route import build_route, correlated_noise, drive_along, pose_noise
 from v2hdm.simulate.render.renderer import Renderer
@@ -177,7 +177,8 @@ def test_hidden_points_are_those_the_picture_hides():
     agree = rendered.hidden[px[:, 1], px[:, 0]] == hidden_by([box], centre, points)
     assert agree.mean() > 0.985
     assert not hidden_by([box], centre, points).all()
-    assert points_seen(info, cam_from_map, points, [box]).sum() == (~hidden_by([box], centre, points)).sum()
+    is_seen = points_seen(info, cam_from_map, points, placed_boxes([box]))
+    assert is_seen.sum() == (~hidden_by([box], centre, points)).sum()
 
 
 def _crosses(box, eye_map, points_map):

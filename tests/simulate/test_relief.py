@@ -15,7 +15,7 @@ from v2hdm.records import DIAMOND
 from v2hdm.report.metrics import driven_past
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import ReliefConfig
-from v2hdm.simulate.port.drive import inside_image, points_seen, render_drive
+from v2hdm.simulate.port.drive import inside_image, placed_boxes, points_seen, render_drive
 from v2hdm.simulate.port.route import stands
 from v2hdm.simulate.render.ground import intersect_ground
 from v2hdm.simulate.render.relief import Relief
@@ -84,11 +84,11 @@ def test_truth_calls_points_hidden_that_lie_behind_a_box_on_a_slope_or_behind_a_
     at = row - field.first_row
     shows = np.hypot(field.x_m[at, column] - points[:, 0], field.y_m[at, column] - points[:, 1])
     shown = (shows < 3 * field.footprint_m[at, column]) & ~hidden[row, column]
-    is_seen = points_seen(INFO, CAM_FROM_MAP, points, [box], relief)
+    is_seen = points_seen(INFO, CAM_FROM_MAP, points, placed_boxes([box]), relief)
     # Beside a crest a pixel shows metres, and points differ by its rounding.
     assert (is_seen == shown).mean() > 0.95
     assert (~is_seen).sum() > 300
-    assert (~points_seen(INFO, CAM_FROM_MAP, points, [], relief)).sum() > 200
+    assert (~points_seen(INFO, CAM_FROM_MAP, points, placed_boxes([]), relief)).sum() > 200
 
 
 def test_a_vehicle_stands_on_its_wheels():

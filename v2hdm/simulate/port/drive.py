@@ -34,7 +34,7 @@ from v2hdm.simulate.port.config import PortConfig, ReliefConfig, SignsConfig
 from v2hdm.simulate.port.route import measured_disturbances, pose_noise
 from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
-from v2hdm.simulate.render.scene import Box, ground_under
+from v2hdm.simulate.render.scene import Box
 from v2hdm.store.files import refuse_url, whole_file
 from v2hdm.store.folders import note_use
 
@@ -47,27 +47,42 @@ def points_seen(
     info: CameraInfo,
     cam_from_map: FloatArray,
     points_map: FloatArray,
-    boxes: Sequence[Box],
+    boxes: FloatArray,
     relief: Relief | None = None,
 ) -> BoolArray:
-    """Flags (N,) of ground points (N, 2) that an image shows: inside its border, within 40 m, not hidden."""
+    """Flags (N,) of ground points (N, 2) that an image shows: inside its border, within 40 m, not hidden.
+
+    ``boxes`` are those of :func:`placed_boxes`.
+    """
     centre = camera_centre(cam_from_map)
     offset_map = points_map - centre[:2]
     visible = np.hypot(offset_map[:, 0], offset_map[:, 1]) < _FARTHEST_M
     visible[visible] = inside_image(info, cam_from_map, points_map[visible], relief)
-    occluders = []
-    for box in boxes:
-        # Before the camera, near enough, and not above all its sight lines to the ground.
-        reach = float(np.hypot(box.size_m[0], box.size_m[1])) / 2
-        depth = float(cam_from_map[2, :3] @ (*box.centre_map, box.beneath.height_m) + cam_from_map[2, 3])
-        above_m = centre[2] - ground_under(box, centre[:2])
-        if box.base_m < above_m and -reach < depth < _FARTHEST_M + reach:
-            occluders.append(box)
-    if visible.any() and (occluders or relief is not None):
+    occluders = boxes[_may_hide(boxes, cam_from_map)]
+    if visible.any() and (len(occluders) or relief is not None):
         points = _on_ground(points_map[visible], relief)
-        hidden = hidden_by(occluders, centre, points)
+        hidden = _crossing(occluders, centre, points)
         visible[visible] = ~(hidden if relief is None else hidden | relief.hides(centre, points))
     return np.asarray(visible)
+
+
+def placed_boxes(boxes: Sequence[Box]) -> FloatArray:
+    """Boxes as rows (B, 11): their centre's x and y, yaw's cosine and sine, size, base, plane beneath; m."""
+    placed = [
+        (*box.centre_map, np.cos(box.yaw_rad), np.sin(box.yaw_rad), *box.size_m, box.base_m, *box.beneath)
+        for box in boxes
+    ]
+    return np.array(placed).reshape(-1, 11)
+
+
+def _may_hide(boxes: FloatArray, cam_from_map: FloatArray) -> BoolArray:
+    """Flags (B,) of boxes before the camera, near enough, and not above all its sight lines to the ground."""
+    centre = camera_centre(cam_from_map)
+    reach = np.hypot(boxes[:, 4], boxes[:, 5]) / 2
+    depth = boxes[:, [0, 1, 8]] @ cam_from_map[2, :3] + cam_from_map[2, 3]
+    height_m = boxes[:, 8] + ((centre[:2] - boxes[:, :2]) * boxes[:, 9:]).sum(axis=1)
+    is_below = boxes[:, 7] < centre[2] - height_m
+    return np.asarray(is_below & (-reach < depth) & (depth < _FARTHEST_M + reach))
 
 
 def _on_ground(points_map: FloatArray, relief: Relief | None) -> FloatArray:
@@ -94,14 +109,15 @@ def inside_image(
 
 def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArray) -> BoolArray:
     """Flags (N,) of lines from ``centre_map`` (3,) to points (N, 2 or 3) through a box (Kay, Kajiya 1986)."""
-    hidden = np.zeros(len(points_map), dtype=np.bool_)
     points = points_map if points_map.shape[1] == 3 else _on_ground(points_map, None)
-    placed = [
-        (*box.centre_map, np.cos(box.yaw_rad), np.sin(box.yaw_rad), *box.size_m, box.base_m, *box.beneath)
-        for box in boxes
-    ]
-    lines = (np.asarray(centre_map), np.ascontiguousarray(points, dtype=np.float64))
-    _cross_boxes(np.array(placed).reshape(-1, 11), *lines, hidden)
+    return _crossing(placed_boxes(boxes), centre_map, points)
+
+
+def _crossing(boxes: FloatArray, centre_map: FloatArray, points_map: FloatArray) -> BoolArray:
+    """Flags (N,) of lines from a centre (3,) to points (N, 3) through one of boxes (B, 11)."""
+    hidden = np.zeros(len(points_map), dtype=np.bool_)
+    lines = (np.asarray(centre_map), np.ascontiguousarray(points_map, dtype=np.float64))
+    _cross_boxes(boxes, *lines, hidden)
     return hidden
 
 
@@ -129,10 +145,7 @@ def _between(low: float, high: float, start: float, end: float) -> tuple[float, 
 def _cross_boxes(
     boxes: FloatArray, centre_map: FloatArray, points_map: FloatArray, hidden: BoolArray
 ) -> None:
-    """Mark in ``hidden`` (N,) the lines from a centre (3,) to points (N, 3) through one of boxes (B, 11).
-
-    A box is its centre's x and y, its yaw's cosine and sine, its size, its base, and the plane beneath it.
-    """
+    """Mark in ``hidden`` (N,) the lines from a centre (3,) to points (N, 3) through one of boxes (B, 11)."""
     for b in range(len(boxes)):
         box = boxes[b]
         half_length = box[4] / 2
@@ -314,10 +327,12 @@ def _truth(port: Port, images: list[Image]) -> Truth:
     scene = port.renderer.scene
     relief = scene.relief
     passed = np.zeros(len(points) - samples.size // 2, dtype=int)
+    at_rest = placed_boxes(scene.boxes)
     for i, image in enumerate(images):
-        frame = i // len(port.cameras)
+        frame, first = divmod(i, len(port.cameras))
         camera = port.cameras[image.camera]
-        boxes = scene.boxes + port.moving_boxes(frame)
+        if not first:
+            boxes = np.concatenate([at_rest, placed_boxes(port.moving_boxes(frame))])
         visible = points_seen(camera.info, port.cam_from_map(image.camera, frame), points, boxes, relief)
         visibility[i] = visible[: samples.size // 2].reshape(-1, per_marking).mean(axis=1)
         on_lanes = visible[samples.size // 2 :]
