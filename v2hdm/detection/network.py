@@ -315,7 +315,7 @@ def run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:
     # Only whole elements have mirror images on the same grid.
     padded = cv2.copyMakeBorder(image_bgr, 0, 0, 0, -width % info.multiple, cv2.BORDER_REPLICATE)
     output = network.run(padded)
-    mirrored = network.run(np.ascontiguousarray(padded[:, ::-1]))
+    mirrored = network.run(cv2.flip(padded, 1))
     odds, offset = output.lanes
     mirrored_odds, mirrored_offset = mirrored.lanes[..., ::-1] * _MIRRORED
     # Where a line crosses a cell only that output knows that sees it cross.
