@@ -5,6 +5,7 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -127,18 +128,31 @@ class Sheet:
         return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), in_view
 
 
-def _looked_up(table: FloatArray, u_px: FloatArray, v_px: FloatArray) -> FloatArray:
+class _Edge(NamedTuple):
+    """Edges (R, C) of boxes along one axis of a table: the cell that each lies in, and how far."""
+
+    cell: IntArray
+    into: FloatArray
+
+    @classmethod
+    def at(cls, edge_px: FloatArray, last: int) -> _Edge:
+        """The edges at ``edge_px``, up to the end of the ``last`` cell."""
+        cell = np.minimum(edge_px.astype(np.intp), last)
+        return cls(cell, edge_px - cell)
+
+
+def _looked_up(table: FloatArray, down: _Edge, across: _Edge) -> FloatArray:
     """Bilinear values (R, C) of a table.
 
     ``cv2.remap`` rounds places to 1/32 px, so that poses a nanometre apart gave a mounting 0.1 sigma apart.
     """
-    column = np.minimum(u_px.astype(np.intp), table.shape[1] - 2)
-    row = np.minimum(v_px.astype(np.intp), table.shape[0] - 2)
-    right = u_px - column
-    below = v_px - row
-    upper = table[row, column] * (1 - right) + table[row, column + 1] * right
-    lower = table[row + 1, column] * (1 - right) + table[row + 1, column + 1] * right
-    return np.asarray(upper * (1 - below) + lower * below)
+    values = table.ravel()
+    place = down.cell * table.shape[1] + across.cell
+    rest = 1 - across.into
+    upper = values.take(place) * rest + values.take(place + 1) * across.into
+    place += table.shape[1]
+    lower = values.take(place) * rest + values.take(place + 1) * across.into
+    return np.asarray(upper * (1 - down.into) + lower * down.into)
 
 
 def box_means(grey: ImageArray, centres_px: FloatArray, extent_px: FloatArray) -> Float32Array:
@@ -156,8 +170,10 @@ def box_means(grey: ImageArray, centres_px: FloatArray, extent_px: FloatArray) -
     corner_v = int(top.min())
     used = grey[corner_v : int(np.ceil(bottom.max())), corner_u : int(np.ceil(right.max()))]
     table = np.asarray(cv2.integral(used, sdepth=cv2.CV_64F), dtype=np.float64)
+    columns = [_Edge.at(u - corner_u, table.shape[1] - 2) for u in (right, left)]
+    rows = [_Edge.at(v - corner_v, table.shape[0] - 2) for v in (bottom, top)]
     lower_right, lower_left, upper_right, upper_left = (
-        _looked_up(table, u - corner_u, v - corner_v) for v in (bottom, top) for u in (right, left)
+        _looked_up(table, down, across) for down in rows for across in columns
     )
     total = lower_right - lower_left - upper_right + upper_left
     area = np.maximum((right - left) * (bottom - top), 1 / 32**2)  # none beyond the border
@@ -180,8 +196,11 @@ def patch_centres(
     centres = centres[inside]
     if not len(centres):
         return centres
-    in_strip = np.linalg.norm(centres[:, None] - path_map[None], axis=2).min(axis=1) <= STRIP_M
-    return np.asarray(centres[in_strip])
+    low = centres.min(axis=0) - STRIP_M
+    high = centres.max(axis=0) + STRIP_M
+    around = path_map[((path_map >= low) & (path_map <= high)).all(axis=1)]
+    distance_m = np.linalg.norm(centres[:, None] - around[None], axis=2)
+    return np.asarray(centres[distance_m.min(axis=1, initial=np.inf) <= STRIP_M])
 
 
 def _lattice(roi_vehicle: FloatArray) -> FloatArray:
