@@ -22,7 +22,7 @@ from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import turned_left
 from v2hdm.mosaic.views import Canvas, Lens, Shot
 from v2hdm.progress import Progress, Steps
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.safe.pixels import read_pixels
 
 TILE_PX = 64  # side of a tile, px of the canvas
@@ -54,19 +54,39 @@ def plan_sheets(
     Tiles outside of the ``area`` are left out.
     """
     canvas_from_map = canvas.canvas_from_map
-    in_sheet = side_px // TILE_PX
     limit = np.ceil([canvas.columns / TILE_PX, canvas.rows / TILE_PX]).astype(int)
-    plan: dict[tuple[int, int], Views] = {}
-    for index, shot in enumerate(shots):
-        outline = shot.outline_map(lenses[shot.camera])
-        tiles = tiles_under(outline @ canvas_from_map[:2, :2].T + canvas_from_map[:2, 2], limit)
-        if area is not None:
-            tiles = tiles[area.meets(canvas, tiles)]
-        for sheet in np.unique(tiles // in_sheet, axis=0):
-            mine = tiles[(tiles // in_sheet == sheet).all(axis=1)] - sheet * in_sheet
-            key = (int(sheet[1]) * side_px, int(sheet[0]) * side_px)
-            plan.setdefault(key, []).append((index, mine))
-    return [SheetPlan(row, column, views) for (row, column), views in plan.items()]
+    outlines = [shot.outline_map(lenses[shot.camera]) for shot in shots]
+    by_shot = [
+        tiles_under(outline @ canvas_from_map[:2, :2].T + canvas_from_map[:2, 2], limit)
+        for outline in outlines
+    ]
+    tiles = np.concatenate([np.empty((0, 2), dtype=int), *by_shot])
+    shot_of = np.repeat(np.arange(len(shots)), [len(shown) for shown in by_shot])
+    if area is not None:
+        # Each tile once, as many images show it.
+        number, place = np.unique(tiles @ [1, limit[0]], return_inverse=True)
+        is_meant = area.meets(canvas, np.column_stack([number % limit[0], number // limit[0]]))[place]
+        tiles, shot_of = tiles[is_meant], shot_of[is_meant]
+    in_sheet = side_px // TILE_PX
+    sheet = tiles // in_sheet
+    order = np.lexsort([shot_of, sheet[:, 1], sheet[:, 0]])
+    plan = []
+    for of_sheet in _runs(order, sheet):
+        column, row = sheet[of_sheet[0]].tolist()
+        views = [
+            (int(shot_of[of_view[0]]), tiles[of_view] - [in_sheet * column, in_sheet * row])
+            for of_view in _runs(of_sheet, shot_of[:, None])
+        ]
+        plan.append(SheetPlan(side_px * row, side_px * column, views))
+    return sorted(plan, key=lambda sheet: sheet.views[0][0])
+
+
+def _runs(order: IntArray, keys: np.ndarray) -> list[IntArray]:
+    """The parts of an ``order`` in which rows of ``keys`` (N, ...) are the same; empty for an empty one."""
+    if not len(order):
+        return []
+    is_new = (np.diff(keys[order], axis=0) != 0).any(axis=1)
+    return np.split(order, np.flatnonzero(is_new) + 1)
 
 
 def over_sheets(
@@ -100,9 +120,11 @@ def tiles_under(polygon: FloatArray, limit: np.ndarray) -> np.ndarray:
     tiles = np.column_stack([columns.ravel(), rows.ravel()])
     normal = turned_left(np.roll(polygon, -1, axis=0) - polygon)
     normal *= np.sign(np.einsum("ni,ni->n", normal, polygon.mean(axis=0) - polygon))[:, None]
+    # Of a tile's corners the same one reaches farthest across an edge, whichever tile it is.
     corners = TILE_PX * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) - 0.5
-    reach = ((TILE_PX * tiles[:, None, None] + corners[:, None] - polygon) * normal).sum(axis=-1)
-    return np.asarray(tiles[(reach.max(axis=1) >= 0).all(axis=1)])
+    farthest = (normal @ corners.T).max(axis=1) - np.einsum("ni,ni->n", normal, polygon)
+    reach = normal @ (TILE_PX * tiles.T.astype(np.float64)) + farthest[:, None]
+    return np.asarray(tiles[(reach >= 0).all(axis=0)])
 
 
 @dataclass(frozen=True)
