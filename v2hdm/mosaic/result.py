@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from contextvars import copy_context
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -227,21 +229,33 @@ def write_mosaic(
     hd_map = read_geojson(folder / names.MAP)
     ground = ground_of(folder, drive, resolution_m, hd_map)
     picture = Picture(ground.canvas)
-    with ExitStack() as stack:
-        try:
-            put = stack.enter_context(geotiff(folder / names.MOSAIC, ground.canvas, drive.origin))
-        except ConfigError as missing:
-            _log.warning("no GeoTIFF was written: %s", missing)
-            put = None
-        consensus = ground.consensus(progress, executor)
-        for sheet in blend(
-            ground.canvas, ground.after, ground.lenses, progress, consensus, ground.area, executor
-        ):
-            for block in _shown_blocks(sheet):
-                if put is not None:
-                    put(block)
-                picture.put(block)
-    picture.write(folder / names.MOSAIC_PICTURE)
+
+    def draw() -> None:
+        picture.write(folder / names.MOSAIC_PICTURE)
+        panels = {
+            "before: initial calibration, recorded poses": ground.before,
+            "after: optimised calibration, adjusted poses": ground.after,
+        }
+        save_comparison(folder / names.COMPARISON, richest_place(drive, hd_map), panels, ground.lenses)
+
+    with ThreadPoolExecutor(1) as beside:
+        with ExitStack() as stack:
+            try:
+                put = stack.enter_context(geotiff(folder / names.MOSAIC, ground.canvas, drive.origin))
+            except ConfigError as missing:
+                _log.warning("no GeoTIFF was written: %s", missing)
+                put = None
+            consensus = ground.consensus(progress, executor)
+            for sheet in blend(
+                ground.canvas, ground.after, ground.lenses, progress, consensus, ground.area, executor
+            ):
+                for block in _shown_blocks(sheet):
+                    if put is not None:
+                        put(block)
+                    picture.put(block)
+            # GDAL puts the GeoTIFF in order, on one core, as its block ends.
+            drawn = beside.submit(copy_context().run, draw)
+        drawn.result()
     content = {
         "image": names.MOSAIC_PICTURE,
         "bounds_m": ground.canvas.bounds_m,
@@ -250,11 +264,6 @@ def write_mosaic(
         "geotiff_resolution_m": resolution_m,
         "crs": crs_of(drive.origin),
     }
-    panels = {
-        "before: initial calibration, recorded poses": ground.before,
-        "after: optimised calibration, adjusted poses": ground.after,
-    }
-    save_comparison(folder / names.COMPARISON, richest_place(drive, hd_map), panels, ground.lenses)
     write_json(folder / names.MOSAIC_EXTENT, content)
     return content
 
