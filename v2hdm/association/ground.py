@@ -70,8 +70,12 @@ def _on_ground(
 ) -> tuple[FloatArray, FloatArray]:
     """:func:`ground_points_with_jacobian` of pixels (N, K, 2), each under the pose at its row's read-out."""
     if rig.read_out_s is None:
+        # Each image holds dozens of sightings.
+        frames = len(rig.map_from_vehicle)
+        images, image = np.unique(camera * frames + frame, return_inverse=True)
+        camera, frame = np.divmod(images, frames)
         ipms = ground_from_pinhole_px(rig.intrinsic[camera], rig.cam_from_map(camera, frame))
-        return ground_points_with_jacobian(ipms, pinhole_px)
+        return ground_points_with_jacobian(ipms[image], pinhole_px)
     camera, frame = (np.broadcast_to(index[:, None], row_share.shape).ravel() for index in (camera, frame))
     cam_from_map = rig.cam_from_map(camera, frame, row_share.ravel())
     ipms = ground_from_pinhole_px(rig.intrinsic[camera], cam_from_map)
@@ -89,8 +93,7 @@ def locate(sightings: Sightings, rig: Rig) -> Located:
     poses = rig.map_from_vehicle[frame]
     centre_map = (poses[:, :3, :3] @ centre_vehicle[..., None])[..., 0] + poses[:, :3, 3]
     finite = np.asarray(np.isfinite(corners_map).all(axis=-1) & np.isfinite(covariance).all(axis=(-1, -2)))
-    smallest = np.linalg.eigvalsh(np.where(finite[..., None, None], covariance, np.eye(2)))[..., 0]
-    informs = sightings.informs & finite & (smallest < _HORIZON_M2)
+    informs = sightings.informs & finite & (_least_variance(covariance) < _HORIZON_M2)
     return Located(
         corners_map=corners_map,
         covariance_m2=covariance,
@@ -99,6 +102,12 @@ def locate(sightings: Sightings, rig: Rig) -> Located:
         valid=sightings.valid & informs,
         informs=informs,
     )
+
+
+def _least_variance(covariance: FloatArray) -> FloatArray:
+    """Smaller eigenvalues (...) of covariances (..., 2, 2)."""
+    x, y = covariance[..., 0, 0], covariance[..., 1, 1]
+    return np.asarray((x + y) / 2 - np.hypot((x - y) / 2, covariance[..., 0, 1]))
 
 
 def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:
@@ -240,7 +249,7 @@ def easy_views(
         group = np.repeat(whole, [len(views_in_reach) for views_in_reach in views_of_marking])
         view_of_camera = np.array(list(chain.from_iterable(views_of_marking)), dtype=np.int64)
         view = np.flatnonzero(is_of_camera)[view_of_camera]
-        vehicle_from_map = np.asarray(np.linalg.inv(rig.map_from_vehicle[views.frame[view]]), np.float64)
+        vehicle_from_map = rig.vehicle_from_map[views.frame[view]]
         cam_from_vehicle = rig.cam_from_vehicle[c]
         corners = corners_map[group]
         corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners)

@@ -12,12 +12,13 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from v2hdm.association.ground import Located
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import direction_covariance, project_ground
-from v2hdm.geometry.planar import SHIFTS, align, diameters
+from v2hdm.geometry.planar import SHIFTS, align, diameters, inverse_2x2
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
@@ -123,22 +124,23 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     on_line = known_elsewhere(association, located.valid, located.informs)
     noise[on_line] = line_only(noise[on_line], _OPEN_END_M)
     covariance = association.in_group_order(noise) + _CORNER_FLOOR_M**2 * np.eye(2)
-    information = np.linalg.inv(np.where(informs[..., None, None], covariance, np.eye(2)))
+    information = inverse_2x2(np.where(informs[..., None, None], covariance, np.eye(2)))
     corner = np.where(informs, association.group[:, None] * 4 + np.arange(4), association.count * 4)
     points = np.where(informs[..., None], corners, 0.0)
     size = association.count * 4 + 1
+    sums = csr_array((np.ones(corner.size), (corner.ravel(), np.arange(corner.size))), (size, corner.size))
+    pulls = information @ points[..., None]
+    summands = np.concatenate([information.reshape(-1, 4), pulls.reshape(-1, 2)], axis=1)
     weight = informs.astype(float)
     for _ in range(3):
-        total = np.zeros((size, 2, 2))
-        vector = np.zeros((size, 2))
-        weighted = information * weight[..., None, None]
-        np.add.at(total, corner, weighted)
-        np.add.at(vector, corner, (weighted @ points[..., None])[..., 0])
+        by_corner = sums @ (summands * weight.reshape(-1, 1))
+        total = by_corner[:, :4].reshape(-1, 2, 2)
         solvable = np.linalg.det(total) > 0
-        spread = np.linalg.inv(np.where(solvable[:, None, None], total, np.eye(2)))
-        mean = (spread @ vector[..., None])[..., 0]
+        spread = inverse_2x2(np.where(solvable[:, None, None], total, np.eye(2)))
+        mean = (spread @ by_corner[:, 4:, None])[..., 0]
         miss = points - mean[corner]
-        distance = np.sqrt(np.maximum(np.einsum("sci,scij,scj->sc", miss, information, miss), 1e-12))
+        squared = (information @ miss[..., None])[..., 0] * miss
+        distance = np.sqrt(np.maximum(squared.sum(axis=-1), 1e-12))
         weight = informs * np.minimum(1.0, _HUBER_SIGMAS / distance)
     point_sightings = np.bincount(corner[point], minlength=size)[:-1]
     mean[~solvable] = np.nan

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -41,11 +42,16 @@ class Rig:
     ) -> FloatArray:
         """Poses (..., 4, 4) of cameras (...) at frames (...), at the read-out of rows ``row_share`` (...)."""
         cam_from_vehicle = self.cam_from_vehicle[camera]
-        poses = self.map_from_vehicle[frame]
-        if row_share is not None and self.read_out_s is not None and self.twist_vehicle is not None:
-            late_s = self.read_out_s[camera] * np.nan_to_num(row_share)
-            poses = poses @ exp(self.twist_vehicle[frame] * late_s[..., None])
+        if row_share is None or self.read_out_s is None or self.twist_vehicle is None:
+            return np.asarray(cam_from_vehicle @ self.vehicle_from_map[frame])
+        late_s = self.read_out_s[camera] * np.nan_to_num(row_share)
+        poses = self.map_from_vehicle[frame] @ exp(self.twist_vehicle[frame] * late_s[..., None])
         return np.asarray(cam_from_vehicle @ np.linalg.inv(poses))
+
+    @cached_property
+    def vehicle_from_map(self) -> FloatArray:
+        """Inverse poses (F, 4, 4): each is asked for by hundreds of sightings."""
+        return np.asarray(np.linalg.inv(self.map_from_vehicle))
 
     @property
     def height_m(self) -> FloatArray:

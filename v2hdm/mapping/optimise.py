@@ -262,7 +262,8 @@ class Optimiser:
             coarse_model(self.initial_rig, self._noises, self._options),
         )
         association, rig = mapper.run(progress)
-        bundle = self._solve_all(self._with_all_that_fit(association, rig), rig)
+        association = self._with_all_that_fit(association, rig, locate(self.sightings, rig))
+        bundle = self._solve_all(association, rig)
         return self.settle_from(bundle, progress)
 
     def _fit_ground(self, bundle: Bundle, progress: Callable[[str], None], surface: Surface | None) -> Bundle:
@@ -306,7 +307,9 @@ class Optimiser:
 
     def _locate(self, rig: Rig) -> Located:
         """Ground positions, restricted to the range within which sightings form groups."""
-        located = locate(self.sightings, rig)
+        return self._in_range(locate(self.sightings, rig))
+
+    def _in_range(self, located: Located) -> Located:
         with np.errstate(invalid="ignore"):
             in_range = located.range_m <= self._options.max_range_m
         return replace(located, valid=located.valid & in_range, informs=located.informs & in_range)
@@ -328,19 +331,21 @@ class Optimiser:
 
     def _associate(self, rig: Rig) -> Association:
         """Tracks under an optimised ``rig``, merged across gaps, laps and cameras."""
-        located = self._locate(rig)
+        anywhere = locate(self.sightings, rig)
+        located = self._in_range(anywhere)
         tracks = self._track(rig, located, REFINED_SIGMA_RAD)
         fused = fuse_groups(tracks, located, self._pose_noise.roll_pitch_rad)
         range_m = float(np.median(located.range_m[located.valid]))
         direction_m = REFINED_SIGMA_RAD * range_m**2 / float(np.median(rig.height_m))
         floor_m = float(np.hypot(self._pose_noise.position_m, direction_m))
-        return self._with_all_that_fit(merge_groups(tracks, self.sightings, fused, floor_m=floor_m), rig)
+        merged = merge_groups(tracks, self.sightings, fused, floor_m=floor_m)
+        return self._with_all_that_fit(merged, rig, anywhere)
 
-    def _with_all_that_fit(self, association: Association, rig: Rig) -> Association:
-        """The groups plus ungrouped sightings, at any range, that fit exactly one of them."""
+    def _with_all_that_fit(self, association: Association, rig: Rig, located: Located) -> Association:
+        """The groups plus ungrouped sightings, ``located`` at any range, that fit exactly one of them."""
         jitter_rad = self._pose_noise.roll_pitch_rad
-        fused = fuse_groups(association, self._locate(rig), jitter_rad)
-        return attach(association, self.sightings, locate(self.sightings, rig), rig, fused, jitter_rad)
+        fused = fuse_groups(association, self._in_range(located), jitter_rad)
+        return attach(association, self.sightings, located, rig, fused, jitter_rad)
 
     def _solve(
         self,
