@@ -22,7 +22,7 @@ from scipy.special import logsumexp
 from v2hdm.association.sightings import row_shares
 from v2hdm.catalogue import AREA, SHIPPED
 from v2hdm.densities import log_normal_density
-from v2hdm.detection.batch import read_grey
+from v2hdm.detection.frames import read_image
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, has_distortion
@@ -42,6 +42,7 @@ from v2hdm.records import (
     Trajectory,
 )
 from v2hdm.report.page.facts import CameraFacts, Facts, read_facts
+from v2hdm.safe.pixels import grey_of
 from v2hdm.site.living.looks import HIDDEN_SIGMA
 from v2hdm.store.files import write_json
 from v2hdm.surface.surface import Surface
@@ -228,7 +229,7 @@ def write_labels(
     for number, image in enumerate(drive.images):
         if image.camera in facts.cameras:
             eye = _Eye.of(image, facts.cameras[image.camera], facts)
-            grey = read_grey(image, drive.cameras[image.camera])
+            grey = grey_of(read_image(image, drive.cameras[image.camera]))
             detected = detected_in.get(drive.name_of(image.path), set())
             views += _views(eye, grey, outlines, len(images), detected, range_m)
             silent += [(len(images), polygon) for polygon in _silent(eye, facts, range_m)]

@@ -15,9 +15,8 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.frames import read_bgr
+from v2hdm.detection.frames import read_bgr, read_image
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.errors import DriveError
 from v2hdm.executor import HERE, Executor
 from v2hdm.records import BoolArray, Camera, Drive, Image, ImageDetections
 
@@ -28,7 +27,6 @@ _WORKERS_A_GPU = 8  # processes that share a GPU: each takes memory of its own t
 Detect = Callable[[Drive, DetectorOptions, Sequence[int], Executor, Callable[[ImageDetections], None]], None]
 """A function that does what :func:`detect_images` does."""
 
-_STRIP_ROWS = 32  # rows that turn grey at a time: all rows as float32 would leave the processor's cache
 _FEW_IMAGES = 8  # fewer images than this are looked at before a process has started
 _IMAGES_TOGETHER = 4  # most images that a process looks at before it reports; chosen
 
@@ -68,29 +66,6 @@ def _learn(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolA
     mask[top : top + rows, :columns] = in_pixels[:rows, :columns]
     size = 2 * _MARGIN_PX + 1
     return np.asarray(cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0)
-
-
-def read_image(image: Image, camera: Camera) -> np.ndarray:
-    """Decode an image of a drive to (H, W, 3) uint8 BGR; raises DriveError where it is not the camera's."""
-    pixels = read_bgr(image.path)
-    expected = (camera.info.height, camera.info.width)
-    if pixels.shape[:2] != expected:
-        raise DriveError(
-            f"{image.path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but the camera_info of camera "
-            f"'{image.camera}' says {expected[1]}x{expected[0]}; fix the camera_info or the image list"
-        )
-    return pixels
-
-
-def read_grey(image: Image, camera: Camera) -> np.ndarray:
-    """The grey values (H, W) float32 of an image file of a drive; raises as :func:`read_image`."""
-    bgr = read_image(image, camera)
-    grey = np.empty(bgr.shape[:2], dtype=np.float32)
-    for row in range(0, len(bgr), _STRIP_ROWS):
-        strip = slice(row, row + _STRIP_ROWS)
-        # Numpy takes five times as long for a mean over three channels.
-        cv2.transform(bgr[strip].astype(np.float32), np.ones((1, 3), dtype=np.float32), grey[strip])
-    return np.divide(grey, np.float32(3), out=grey)
 
 
 def detect_all(

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.records import FloatArray
+from v2hdm.records import Camera, FloatArray, Image
 from v2hdm.safe.pixels import AS_STORED, VIDEO_OPTIONS, is_image_name, read_pixels
 from v2hdm.safe.texts import number_key
 
@@ -44,6 +44,18 @@ def read_bgr(path: Path) -> np.ndarray:
     if pixels.ndim == 2:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)
     return np.asarray(pixels)
+
+
+def read_image(image: Image, camera: Camera) -> np.ndarray:
+    """Decode an image of a drive to (H, W, 3) uint8 BGR; raises DriveError where it is not the camera's."""
+    pixels = read_bgr(image.path)
+    expected = (camera.info.height, camera.info.width)
+    if pixels.shape[:2] != expected:
+        raise DriveError(
+            f"{image.path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but the camera_info of camera "
+            f"'{image.camera}' says {expected[1]}x{expected[0]}; fix the camera_info or the image list"
+        )
+    return pixels
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
 from v2hdm.association.ground import views_of
 from v2hdm.association.groups import Association
 from v2hdm.association.sightings import Rig, Sightings, collect_sightings
@@ -20,7 +17,7 @@ from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import Drive, Image, ImageDetections, Lane
 from v2hdm.site.options import JOINT
-from v2hdm.site.standing import Grey
+from v2hdm.site.standing import Grey, Pixels
 from v2hdm.surface.surface import Surface
 
 _LOOSE_CENTRE_SIGMA_M = 10.0  # standard deviation of a surveyed axis after its contradiction: uninformative
@@ -34,7 +31,7 @@ class Inputs:
     detections: Sequence[ImageDetections]
     cameras: Sequence[str]
     options: MappingOptions
-    grey: Callable[[Image], NDArray[np.float32]] | None = None  # reads an image's grey values (H, W)
+    grey: Callable[[Image], Pixels] | None = None  # reads an image for its grey values
 
     @property
     def grey_of_image(self) -> Grey | None:

@@ -10,7 +10,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.adjust import Status, observability
 from v2hdm.association.ground import views_of
@@ -48,6 +47,7 @@ from v2hdm.site.corrections import added_markings, with_symbols_corrected
 from v2hdm.site.line_corrections import with_lines_corrected
 from v2hdm.site.living.changes import Base, update_map
 from v2hdm.site.living.looks import Observer
+from v2hdm.site.standing import Pixels
 
 
 def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
@@ -162,16 +162,17 @@ def run_methods(
     options: MappingOptions | None = None,
     progress: Callable[[str], None] = silent,
     base: Base | None = None,
-    grey: Callable[[Image], NDArray[np.float32]] | None = None,
+    grey: Callable[[Image], Pixels] | None = None,
     *,
     naive: bool = True,
 ) -> dict[str, MethodResult]:
     """Map a drive, ignoring ground truth, by every method that the cameras' IPMs allow.
 
     ``progress`` receives the name of each step at its start. ``Opt`` updates the earlier map ``base``;
-    ``grey`` reads the images in which it looks at bare places and at ends (grey values (H, W)). Results are
-    by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``; without ``naive``
-    ``Opt`` alone. Raises MappingError if there is nothing to map, ConfigError for an option out of range.
+    ``grey`` reads the images in which it looks at bare places and at ends: grey values (H, W) or colours
+    (H, W, 3). Results are by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``,
+    ``ONI``; without ``naive`` ``Opt`` alone. Raises MappingError if there is nothing to map, ConfigError for
+    an option out of range.
     """
     options = options or MappingOptions()
     check_options(options)

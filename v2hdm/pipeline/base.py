@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from v2hdm.detection.frames import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive.road import lay_flat
 from v2hdm.io.maps.evidence import read_exclusions
@@ -20,6 +20,7 @@ from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.config import base_files
 from v2hdm.records import Camera, Change, Changes, Drive, Fate, Image
 from v2hdm.site.living.changes import Base
+from v2hdm.site.standing import Pixels
 
 _SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
 LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)  # fates that are changes of the site, and no want of images
@@ -68,8 +69,8 @@ def check_together(base: Base, drive: Drive, path: str) -> None:
         )
 
 
-def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]] | None:
-    """Reads the grey values of a drive's images; None where it has no pictures."""
+def grey_reader(drive: Drive) -> Callable[[Image], Pixels] | None:
+    """Reads a drive's images for their grey values; None where it has no pictures."""
     if not drive.has_pictures:
         return None
     return _GreyReader(drive.cameras)
@@ -77,14 +78,13 @@ def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]] | None:
 
 @dataclass(frozen=True)
 class _GreyReader:
-    """Reads grey values of images of these cameras; other than a closure, it can go to another process."""
+    """Reads images of these cameras; other than a closure, it can go to another process."""
 
     cameras: Mapping[str, Camera]
 
-    def __call__(self, image: Image) -> NDArray[np.float32]:
-        from v2hdm.detection.batch import read_grey
-
-        return read_grey(image, self.cameras[image.camera])
+    def __call__(self, image: Image) -> Pixels:
+        # Grey values are wanted of small parts: those of whole images would take a third of the time.
+        return read_image(image, self.cameras[image.camera])
 
 
 def changes_json(changes: Changes) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.batch import read_image
+from v2hdm.detection.frames import read_image
 from v2hdm.io.maps.corrections import Correction
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.context import Context

@@ -24,8 +24,10 @@ from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray
+from v2hdm.safe.pixels import grey_of
 
-Grey = Callable[[int], NDArray[np.float32]]  # grey values (H, W) of an image, by its index in the drive
+Pixels = NDArray[np.float32] | NDArray[np.uint8]  # grey values (H, W), or colours (H, W, 3)
+Grey = Callable[[int], Pixels]  # pixels of an image, by its index in the drive, whose grey values count
 
 _RANGE_M = (2.5, 16.0)  # depths, m, of an end in images that are compared: nearer and farther it is a few px
 _LEAST_RATIO = 1.2  # least ratio of the depths of an end in two images, that ground and face move apart
@@ -207,10 +209,8 @@ class _End(NamedTuple):
         )
 
 
-def _log_grey(
-    grey: NDArray[np.float32], points_px: Sequence[FloatArray], blur_px: float = 0.0
-) -> list[FloatArray]:
-    """Logarithms of the grey values (H, W) of an image at points (N, 2), interpolated, after a blur.
+def _log_grey(pixels: Pixels, points_px: Sequence[FloatArray], blur_px: float = 0.0) -> list[FloatArray]:
+    """Logarithms of an image's grey values at points (N, 2), interpolated, after a blur.
 
     Only the part of the image with the points is looked at: it is a small one.
     """
@@ -218,7 +218,7 @@ def _log_grey(
     margin = int(np.ceil(_BLUR_SIGMAS * blur_px)) + 2
     corner = np.maximum(np.min([px.min(axis=1) for px in points], axis=0).astype(np.int64) - margin, 0)
     end = np.max([px.max(axis=1) for px in points], axis=0).astype(np.int64) + margin + 1
-    values = np.log(grey[corner[1] : end[1], corner[0] : end[0]] + np.float32(_DARK))
+    values = np.log(grey_of(pixels[corner[1] : end[1], corner[0] : end[0]]) + np.float32(_DARK))
     if blur_px:
         values = cv2.GaussianBlur(values, (0, 0), blur_px)
     maps = [px - corner.astype(np.float32)[:, None] for px in points]

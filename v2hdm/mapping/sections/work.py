@@ -42,8 +42,9 @@ from v2hdm.records import BoolArray, FloatArray, Image, ImageDetections, IntArra
 from v2hdm.site.candidates import Candidates, Counts
 from v2hdm.site.markings import Classified
 from v2hdm.site.parallax import Parallax
+from v2hdm.site.standing import Pixels
 
-GreyOf = Callable[[Image], NDArray[np.float32]]
+GreyOf = Callable[[Image], Pixels]
 DetectionsOf = Callable[[Sequence[Image], IntArray], Sequence[ImageDetections]]
 """Detections in some images, whose numbers in the drive are given, too; numbered in the order of these."""
 
@@ -460,7 +461,7 @@ def classified_of(classified: Classified, rows: IntArray, names: Names, kinds: S
     )
 
 
-def _grey_of(grey: GreyOf, images: Sequence[Image], image: int) -> NDArray[np.float32]:
+def _grey_of(grey: GreyOf, images: Sequence[Image], image: int) -> Pixels:
     return grey(images[image])
 
 

@@ -10,7 +10,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from v2hdm.detection.batch import read_image
+from v2hdm.detection.frames import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points

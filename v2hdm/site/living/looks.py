@@ -23,6 +23,7 @@ from v2hdm.densities import log_normal_density
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
+from v2hdm.safe.pixels import grey_of
 from v2hdm.site.contrast import Contrast, places_aside, samples_of, usual_contrast
 from v2hdm.site.living.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
@@ -165,7 +166,7 @@ class Observer:
                 places_of_row.setdefault(row, []).append(number)
         contrasts: list[list[float]] = [[] for _ in corners_map]
         for row, numbers in sorted(places_of_row.items()):
-            grey = self.grey(int(self.views.image[row]))
+            grey = grey_of(self.grey(int(self.views.image[row])))
             for number in numbers:
                 contrasts[number].append(self._contrast(grey, row, corners_map[number]))
         return np.array(
