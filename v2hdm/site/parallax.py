@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from v2hdm.adjust import PoseSigma
 from v2hdm.association.ground import Located
@@ -194,8 +195,7 @@ def _of_sills(views: PointViews, count: int) -> tuple[FloatArray, FloatArray]:
 class _Distances(NamedTuple):
     """Squared distances x' A x - 2 b' x + c, in sigmas, of N sightings from candidates with unknowns x."""
 
-    information: FloatArray  # A (N, U, U)
-    gradient: FloatArray  # b (N, U)
+    terms: FloatArray  # (N, U (U + 1) / 2 + U) the upper triangle of each A, then b
     squared: FloatArray  # c (N,)
     log_det: FloatArray  # (N,) of the covariances
 
@@ -204,18 +204,31 @@ class _Distances(NamedTuple):
         """Distances of ``off_m`` (N, R) from ``design`` (N, R, U) times the unknowns."""
         weight = np.linalg.inv(covariance_m2)
         weighted = np.swapaxes(design, 1, 2) @ weight
+        row, column = np.triu_indices(design.shape[2])
         return cls(
-            information=weighted @ design,
-            gradient=(weighted @ off_m[..., None])[..., 0],
+            terms=np.hstack([(weighted @ design)[:, row, column], (weighted @ off_m[..., None])[..., 0]]),
             squared=np.einsum("ni,nij,nj->n", off_m, weight, off_m),
             log_det=np.linalg.slogdet(covariance_m2)[1],
         )
 
-    def at(self, unknowns: FloatArray) -> FloatArray:
-        """The squared distances (N,) at ``unknowns`` (N, U)."""
-        slope = (self.information @ unknowns[..., None])[..., 0] - 2 * self.gradient
-        squared = np.sum(slope * unknowns, axis=1) + self.squared
-        return np.asarray(np.maximum(squared, 0.0))
+    def at(self, factors: FloatArray) -> FloatArray:
+        """The squared distances (N,) at unknowns with these :func:`_factors` (N, ...)."""
+        return np.asarray(np.maximum(np.einsum("nk,nk->n", self.terms, factors) + self.squared, 0.0))
+
+
+def _factors(unknowns: FloatArray) -> FloatArray:
+    """What to multiply the terms of distances with, (G, U (U + 1) / 2 + U), at ``unknowns`` (G, U)."""
+    row, column = np.triu_indices(unknowns.shape[1])
+    return np.hstack([np.where(row == column, 1, 2) * unknowns[:, row] * unknowns[:, column], -2 * unknowns])
+
+
+def _matrices(triangles: FloatArray, size: int) -> FloatArray:
+    """Symmetric matrices (G, U, U), by their upper ``triangles`` (G, U (U + 1) / 2)."""
+    row, column = np.triu_indices(size)
+    matrices = np.empty((len(triangles), size, size))
+    matrices[:, row, column] = triangles
+    matrices[:, column, row] = triangles
+    return matrices
 
 
 class _Fit(NamedTuple):
@@ -302,22 +315,22 @@ class _Model:
         expected = np.zeros((count, len(self.sigma)))
         expected[:, slopes] = np.reshape(1 - mean, (-1, 1))
         by_prior = (prior @ expected[..., None])[..., 0]
+        unknowns = len(self.sigma)
         share = np.ones(len(self.group))
         spread = np.ones(count)
         for factor in _WIDENED:
             variance = np.maximum(factor, spread)[self.group]
             weight = self.effective * share / variance
             other = self.effective * (1 - share)
-            by_image = weight[:, None, None] * self.inlier.information
-            by_image += other[:, None, None] * self.outlier.information
-            information = self.sums.of(by_image) + prior
-            pull = weight[:, None] * self.inlier.gradient + other[:, None] * self.outlier.gradient
-            gradient = self.sums.of(pull) + by_prior
+            terms = self.sums.of(self.inlier.terms, weight) + self.sums.of(self.outlier.terms, other)
+            information = _matrices(terms[:, :-unknowns], unknowns) + prior
+            gradient = terms[:, -unknowns:] + by_prior
             solved = np.asarray(np.linalg.solve(information, gradient[..., None])[..., 0], dtype=np.float64)
-            squared = self.inlier.at(solved[self.group])
+            factors = _factors(solved)[self.group]
+            squared = self.inlier.at(factors)
             size = self.coordinates * np.log(variance) + self.inlier.log_det
             inlier = np.log1p(-_OFF_SHARE) - (squared / variance + size) / 2
-            far = self.outlier.at(solved[self.group]) + self.outlier.log_det
+            far = self.outlier.at(factors) + self.outlier.log_det
             either = np.logaddexp(inlier, np.log(_OFF_SHARE) - far / 2)
             share = np.exp(inlier - either)
             if factor == _WIDENED[-1]:
@@ -344,24 +357,21 @@ def _covariance(views: PointViews, by_pose: FloatArray) -> FloatArray:
 class _Sums(NamedTuple):
     """Sums by group, of which there are G."""
 
-    order: IntArray  # (N,) that brings the members of a group together
-    groups: IntArray  # with members
-    first: IntArray  # of each of these, in that order
-    total: int  # number of groups, G
+    members: csr_array  # (G, N) 1 where a member is of a group
 
     @classmethod
     def by(cls, group: IntArray, count: int) -> _Sums:
         """By groups (N,)."""
-        order = np.argsort(group, kind="stable")
-        groups, first = np.unique(group[order], return_index=True)
-        return cls(order, groups, first, count)
+        size = len(group)
+        return cls(csr_array((np.ones(size), (group, np.arange(size))), shape=(count, size)))
 
-    def of(self, values: FloatArray | BoolArray) -> FloatArray:
-        """Sums (G, ...) of values (N, ...)."""
-        totals = np.zeros((self.total, *values.shape[1:]))
-        if len(self.groups):
-            totals[self.groups] = np.add.reduceat(values[self.order].astype(np.float64), self.first, axis=0)
-        return totals
+    def of(self, values: FloatArray | BoolArray, weight: FloatArray | None = None) -> FloatArray:
+        """Sums (G, ...) of values (N, ...), each with its ``weight`` (N,) or 1."""
+        members = self.members
+        if weight is not None:
+            members = csr_array((weight[members.indices], members.indices, members.indptr), members.shape)
+        totals = members @ values.reshape(len(values), -1).astype(np.float64, copy=False)
+        return np.asarray(totals.reshape(members.shape[0], *values.shape[1:]))
 
 
 def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:
