@@ -24,9 +24,9 @@ import numpy as np
 from tests.benchmarks.real_reference import Painted, Reference, read_reference
 from v2hdm.catalogue import SHIPPED
 from v2hdm.detection import detector as detecting
-from v2hdm.detection.batch import read_image
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.frames import read_image
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.io.drive import read_drive
 from v2hdm.records import BoolArray, FloatArray, Image, LaneDetection, MarkingDetection

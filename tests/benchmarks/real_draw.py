@@ -27,7 +27,7 @@ from tests.benchmarks.real_align import align
 from tests.benchmarks.real_drive import views_of_images
 from tests.benchmarks.real_reference import Reference, Route, read_reference
 from tests.benchmarks.real_view import View
-from v2hdm.detection.batch import read_image
+from v2hdm.detection.frames import read_image
 from v2hdm.io.drive import ReadOptions
 from v2hdm.pipeline.map_drive import map_drive
 from v2hdm.records import FloatArray

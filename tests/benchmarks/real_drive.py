@@ -30,7 +30,7 @@ import numpy as np
 
 from tests.benchmarks.real_reference import TOLERANCE_M, Painted, Reference, centre_of_area, read_reference
 from tests.benchmarks.real_view import View, shaded_share
-from v2hdm.detection.batch import read_image
+from v2hdm.detection.frames import read_image
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.road import draw_detections
 from v2hdm.errors import MapFileError

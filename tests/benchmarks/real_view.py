@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.real_reference import Painted
-from v2hdm.detection.batch import read_image
+from v2hdm.detection.frames import read_image
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px, project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import camera_centre

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.ports import TINY_ROUTE, short_port, small_port
-from v2hdm.detection.batch import read_image
+from v2hdm.detection.frames import read_image
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.records import Calibration, HDMap, PaintLeft

@@ -77,3 +77,11 @@ def test_the_part_of_an_image_around_some_points_says_what_the_whole_image_does(
     u, v = points_px.astype(np.float32).T
     expected = cv2.remap(blurred, u[None], v[None], cv2.INTER_LINEAR)[0]
     np.testing.assert_allclose(_log_grey(grey, [points_px], 1.7)[0], expected, atol=1e-5)
+
+
+def test_of_colours_their_mean_is_looked_at():
+    rng = np.random.default_rng(1)
+    colours = rng.integers(0, 256, (90, 200, 3), dtype=np.uint8)
+    points_px = np.column_stack([rng.uniform(2, 60, 50), rng.uniform(20, 87, 50)])
+    of_mean = _log_grey(colours.astype(np.float32).mean(axis=2), [points_px])[0]
+    np.testing.assert_allclose(_log_grey(colours, [points_px])[0], of_mean, atol=1e-5)
