@@ -14,6 +14,7 @@ from v2hdm.records import Calibration, HDMap, PaintLeft
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import PaintConfig, RouteConfig
 from v2hdm.simulate.render import ground
+from v2hdm.simulate.render.view import Bands
 from v2hdm.site.living import wear
 from v2hdm.site.living.wear import Footage, with_wear
 
@@ -26,14 +27,16 @@ def share_rendered(paint):
     x, y = np.meshgrid(*(np.arange(a, b, 0.01, dtype=np.float32) for a, b in zip(low, high, strict=True)))
     tiles = [ground._WEAR_TILE, ground.MEDIUM_TILE, ground.fine_tile("asphalt")]
     shift = (float(paint.seed % 97) * 0.53, float(paint.seed % 89) * 0.71)
-    scales = np.array([ground.scale_of(tile, shift) for tile in tiles], dtype=np.float32)
+    scales = np.array([[ground.scale_of(tile, shift) for tile in tiles]], dtype=np.float32)
     covered = np.array([[0, 0, 1]] * 4, dtype=np.float32)  # all of every pixel lies within the outline
     white = np.ones((*x.shape, 3), dtype=np.float32)
     black = ground._look(replace(paint, dirt=0.0, albedo_bgr=(0.0, 0.0, 0.0)))
-    whole, footprint_m = np.array([[0, x.shape[0], 0, x.shape[1]]]), np.full_like(x, FOOTPRINT_M)
-    ground.kernels.draw_paint(
-        whole, 1, 0, covered, (x, y), (x, y, footprint_m),
-        tuple(tile.padded for tile in tiles), scales, black, 1, white, np.zeros(x.shape, np.uint8),
+    whole = Bands(np.array([[0, x.shape[0], 0, x.shape[1]]]), np.array([0, 1]))
+    footprint_m = np.full_like(x, FOOTPRINT_M)
+    ground.drawing.draw_paint(
+        whole, 0, covered, np.array([0, 4]), (x, y), (x, y, footprint_m),
+        tuple(tile.padded for tile in tiles), scales, black[None], np.ones(1, np.uint8),
+        np.empty_like(x[:1]), white.reshape(len(x), -1), np.zeros(x.shape, np.uint8),
     )  # fmt: skip
     opacity = 1 - white[..., 0]
     pixels = np.round((paint.polygon_map - low) / 0.01).astype(np.int32)

@@ -1,5 +1,7 @@
 """The 50 % point of a painted edge must lie where the polygon's projection says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -134,6 +136,15 @@ def test_a_painted_edge_lies_within_a_twentieth_of_a_pixel(centre, motion):
     corners = pinhole(diamond)
     offsets = [edge_offset_px(rendered, corners[k], corners[(k + 1) % 4]) for k in range(4)]
     assert np.abs(offsets).max() < 0.05
+
+
+def test_an_image_may_have_any_size():
+    size = {"width": 203, "height": 131}
+    motion = Motion(velocity_cam=(0.0, 1.5, 4.7), exposure_s=0.003)
+    rendered = Renderer(Scene()).render(
+        replace(INFO, **size), CAM_FROM_MAP, np.random.default_rng(0), CLEAN, motion
+    )
+    assert rendered.image.shape == (131, 203, 3)
 
 
 def test_labels_cover_the_polygon_and_nothing_else():

@@ -44,10 +44,12 @@ class Dapple:
         level = float(np.quantile(tile.values[::8, ::8], self.shaded))
         parts = [(slice(None), slice(None))]
         if self.region_map is not None:
-            (shape,) = outlines(view, [on_ground_px(view, self.region_map)])
-            bands, count = (np.empty((0, 4)), 0) if shape is None else bands_of(view, shape, field.first_row)
-            rows = bands[:count] - np.array([field.first_row, field.first_row, 0, 0])
-            parts = [(slice(top, end), slice(left, right)) for top, end, left, right in rows.tolist()]
+            shape = outlines(view, [on_ground_px(view, self.region_map)])
+            windows = [] if shape is None else bands_of(view, shape, field.first_row).windows.tolist()
+            first = field.first_row
+            parts = [
+                (slice(top - first, end - first), slice(left, right)) for top, end, left, right in windows
+            ]
         for part in parts:
             x = field.x_m[part]
             y = field.y_m[part]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from v2hdm.geometry.planar import densified
 from v2hdm.records import FloatArray
-from v2hdm.simulate.render import kernels
+from v2hdm.simulate.render import drawing, kernels
 from v2hdm.simulate.render.relief import Relief, meet_ground
 from v2hdm.simulate.render.scene import (
     Box,
@@ -32,6 +32,7 @@ from v2hdm.simulate.render.view import (
     NEAR_M,
     View,
     bands_of,
+    begins,
     edges_of,
     following_row,
     in_view,
@@ -188,13 +189,8 @@ def _slabs(ground: Ground, slab_m: tuple[float, float], field: GroundField, out:
 
 
 def _marks(marks: GroundMarks, field: GroundField, out: Float32) -> None:
-    scale = np.float32(1.0 / marks.resolution_m)
-    columns = (field.x_m - np.float32(marks.origin_map[0])) * scale
-    rows = (field.y_m - np.float32(marks.origin_map[1])) * scale
-    factor = cv2.remap(
-        marks.factor, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=128
-    )
-    out *= factor.astype(np.float32) * np.float32(1.0 / 128.0)
+    placed = float32s(np.array([*marks.origin_map, 1.0 / marks.resolution_m]))
+    kernels.mark_ground(marks.factor, placed, field.planes, out)
 
 
 class Wetness(NamedTuple):
@@ -227,11 +223,12 @@ class ShadowLayer:
     """Shadows of a scene, prepared once, so that those out of view are cheaply skipped."""
 
     def __init__(self, shadows: Sequence[Shadow]) -> None:
-        self._shadows = shadows
         self._lines = [inward_lines(np.asarray(shadow.polygon_map, dtype=np.float64)) for shadow in shadows]
         self._wider = [_with_penumbra(shadow) for shadow in shadows]
         self._vertices = padded_vertices(self._wider)
         self._first_map = np.array([shadow.polygon_map[0] for shadow in shadows]).reshape(-1, 2)
+        self._softness_m = np.array([shadow.softness_m for shadow in shadows], dtype=np.float32)
+        self._darkness = np.array([1.0 - shadow.transmission for shadow in shadows], dtype=np.float32)
 
     def cast(self, view: View, field: GroundField, out: Float32) -> None:
         """Lower the sun's visibility ``out`` (H', W) to that in the shadows."""
@@ -243,14 +240,15 @@ class ShadowLayer:
                 in_view(view, view.homogeneous_px(view.on_ground(self._vertices[numbers])), np.inf)
             ]
         shapes = outlines(view, [on_ground_px(view, self._wider[number]) for number in numbers])
-        for number, shape in zip(numbers.tolist(), shapes, strict=True):
-            if shape is not None:
-                shadow = self._shadows[number]
-                windows, count = bands_of(view, shape, first)
-                softness_m = np.float32(shadow.softness_m)
-                darkness = np.float32(1.0 - shadow.transmission)
-                lines = self._lines[number]
-                kernels.cast_shadow(windows, count, first, lines, softness_m, darkness, field.planes, out)
+        if shapes is None:
+            return
+        seen = numbers[shapes.numbers]
+        lines = [self._lines[number] for number in seen]
+        line_rows = begins([len(part) for part in lines])
+        drawing.cast_shadows(
+            bands_of(view, shapes, first), first, np.concatenate(lines), line_rows, self._softness_m[seen],
+            self._darkness[seen], field.planes, np.empty_like(out[:1]), out,
+        )  # fmt: skip
 
 
 def sun_visibility(
@@ -315,34 +313,37 @@ _FARTHEST_PAINT_M = 60.0  # largest depth of paint that is drawn
 
 
 class PaintLayer:
-    """All paint of a scene, with its vertices in one array so that what is out of view is cheaply skipped."""
+    """All paint of a scene, prepared once, so that what is out of view is cheaply skipped."""
 
     def __init__(self, paints: tuple[Paint, ...], classes: tuple[str, ...]) -> None:
-        self._paints = paints
-        self._label = {kind: label for label, kind in enumerate(classes, start=1)}
-        polygons = [np.asarray(paint.polygon_map, dtype=np.float64) for paint in paints]
-        self._vertices = padded_vertices(polygons)
+        self._tiles = [_WEAR_TILE, MEDIUM_TILE, fine_tile("asphalt")]
+        self._polygons = [np.asarray(paint.polygon_map, dtype=np.float64) for paint in paints]
+        self._vertices = padded_vertices(self._polygons)
+        label = {kind: label for label, kind in enumerate(classes, start=1)}
+        self._kinds = np.array([label[paint.kind] for paint in paints], dtype=np.uint8)
+        self._looks = np.array([_look(paint) for paint in paints], dtype=np.float32).reshape(-1, 5)
+        shifts = [(float(paint.seed % 97) * 0.53, float(paint.seed % 89) * 0.71) for paint in paints]
+        scales = [[scale_of(tile, shift) for tile in self._tiles] for shift in shifts]
+        self._scales = np.array(scales, dtype=np.float32).reshape(-1, 3, 4)
 
     def draw(self, view: View, field: GroundField, albedo: Float32, labels: Labels) -> None:
-        """Paint onto the ground field's ``albedo`` (H', W, 3) and into ``labels`` (H, W)."""
+        """Paint onto the ground field's ``albedo`` (H', 3 W) and into ``labels`` (H, W)."""
         visible = in_view(view, view.homogeneous_px(view.on_ground(self._vertices)), _FARTHEST_PAINT_M)
-        paints = [self._paints[index] for index in visible]
         flat = view.homogeneous_px(view.on_plane(self._vertices[visible]))
-        polygons = [points[: len(paint.polygon_map)] for points, paint in zip(flat, paints, strict=True)]
-        draped = [on_ground_px(view, paint.polygon_map) for paint in paints] if view.relief else None
+        shown = [self._polygons[number] for number in visible]
+        polygons = [points[: len(polygon)] for points, polygon in zip(flat, shown, strict=True)]
+        draped = [on_ground_px(view, polygon) for polygon in shown] if view.relief else None
+        shapes = outlines(view, polygons, draped)
+        if shapes is None:
+            return
+        seen = visible[shapes.numbers]
         first = field.first_row
-        tiles = [_WEAR_TILE, MEDIUM_TILE, fine_tile("asphalt")]
-        padded = tuple(tile.padded for tile in tiles)
-        for paint, shape in zip(paints, outlines(view, polygons, draped), strict=True):
-            if shape is None:
-                continue
-            shift = (float(paint.seed % 97) * 0.53, float(paint.seed % 89) * 0.71)
-            windows, count = bands_of(view, shape, first)
-            kernels.draw_paint(
-                windows, count, first, edges_of(shape), field.rays, field.planes, padded,
-                np.array([scale_of(tile, shift) for tile in tiles], dtype=np.float32), _look(paint),
-                self._label[paint.kind], albedo, labels,
-            )  # fmt: skip
+        bands = bands_of(view, shapes, first)
+        drawing.draw_paint(
+            bands, first, edges_of(shapes), shapes.edge_rows, field.rays, field.planes,
+            tuple(tile.padded for tile in self._tiles), self._scales[seen], self._looks[seen],
+            self._kinds[seen], np.empty_like(field.x_m[:1]), albedo, labels,
+        )  # fmt: skip
 
 
 def _look(paint: Paint) -> Float32:

@@ -9,7 +9,7 @@ From radiance to a recorded image: blur of lens and motion, exposure, noise, sRG
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
 from typing import Any
@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.records import CameraInfo, FloatArray
+from v2hdm.records import CameraInfo, FloatArray, IntArray
+from v2hdm.simulate.render import drawing, kernels
 from v2hdm.simulate.render import ground as on_ground
-from v2hdm.simulate.render import kernels
 from v2hdm.simulate.render.ground import GroundField, PaintLayer, ShadowLayer
 from v2hdm.simulate.render.scene import (
     Backdrop,
@@ -36,7 +36,16 @@ from v2hdm.simulate.render.scene import (
     noise_tile,
     scale_of,
 )
-from v2hdm.simulate.render.view import Outline, View, bands_of, camera_rays, edges_of, in_view, outlines
+from v2hdm.simulate.render.view import (
+    Outlines,
+    View,
+    bands_of,
+    begins,
+    camera_rays,
+    edges_of,
+    in_view,
+    outlines,
+)
 
 _CORRUGATION_M = 0.28  # length of a wave of a container's corrugated side
 _DIRT_TILE = noise_tile(17, 6.0, 1.2)  # dirt on boxes, repeating after 6 m
@@ -66,10 +75,10 @@ class _Face:
         return np.asarray(np.linalg.norm(self.corners_map[[1, 3]] - self.corners_map[0], axis=1))
 
     @cached_property
-    def plain_colour(self) -> Float32:
-        """Radiance (3, 1, 1) of its box's colour."""
-        lit = [albedo * light for albedo, light in zip(self.box.albedo_bgr, self.lit_bgr, strict=True)]
-        return np.array(lit, dtype=np.float32).reshape(3, 1, 1)
+    def look(self) -> FloatArray:
+        """Radiance of its box's colour, and whether it is corrugated, upright, and has a picture (6,)."""
+        flags = (self.box.corrugated and self.upright, self.upright, self.picture is not None)
+        return np.array([*np.multiply(self.box.albedo_bgr, self.lit_bgr), *flags])
 
     @cached_property
     def dirt_scale(self) -> Float32:
@@ -115,13 +124,13 @@ def draw_boxes(
 
     # Of stacked boxes the upper comes first: its underside lies behind the one below.
     ordered = sorted(visible, key=lambda b: (distance(b[0]), b[0].base_m), reverse=True)
-    turned = [
-        face for _, faces in ordered for face in faces if (centre - face.corners_map[0]) @ face.normal > 1e-3
-    ]
+    faces = [face for _, faces in ordered for face in faces]
+    offset_map = centre - np.array([face.corners_map[0] for face in faces]).reshape(-1, 3)
+    normals = np.array([face.normal for face in faces]).reshape(-1, 3)
+    turned = [faces[number] for number in np.flatnonzero((offset_map * normals).sum(axis=1) > 1e-3)]
     shapes = outlines(view, [view.homogeneous_px(face.corners_map) for face in turned])
-    for face, shape in zip(turned, shapes, strict=True):
-        if shape is not None:
-            _draw_face(face, shape, view, radiance, hidden)
+    if shapes is not None:
+        _draw_faces([turned[number] for number in shapes.numbers], shapes, view, radiance, hidden)
 
 
 def _faces(box: Box, light: Light) -> list[_Face]:
@@ -150,39 +159,66 @@ def _light_on(normal: FloatArray, light: Light) -> Bgr:
     return blue, green, red
 
 
-def _draw_face(face: _Face, shape: Outline, view: View, radiance: Float32, hidden: NDArray[np.bool_]) -> None:
-    edges = edges_of(shape, grown_px=0.5)
+_TOGETHER_PX = 1 << 16  # pixels of windows up to which faces are drawn together: what stays in a cache
+
+
+def _draw_faces(
+    faces: Sequence[_Face], shapes: Outlines, view: View, radiance: Float32, hidden: NDArray[np.bool_]
+) -> None:
+    """Draw faces one over the other, those behind first."""
+    bands = bands_of(view, shapes)
+    heights, widths = (bands.windows[:, 1::2] - bands.windows[:, ::2]).T
+    places = begins(heights * widths)
+    edges = edges_of(shapes, grown_px=0.5)
     rays = (view.rays.u_pinhole_px, view.rays.v_pinhole_px)
-    face_from_pinhole = _plane_of(face, view)
+    planes = _planes_of(faces, view)
     per_focal = np.float32(1.0 / view.rays.info.intrinsic[0, 0])
-    waves = np.empty((0, 0), np.float32)
-    dirt = _DIRT_TILE.padded
-    windows, count = bands_of(view, shape)
-    for window in windows[:count]:
-        patch = np.empty((4, window[1] - window[0], window[3] - window[2]), dtype=np.float32)
-        if not kernels.look_at_face(window, edges, rays, face_from_pinhole, per_focal, patch):
-            continue
-        if face.box.corrugated and face.upright:
-            waves = np.sin(patch[1] * np.float32(2 * np.pi / _CORRUGATION_M))
-        colour = face.plain_colour
-        if face.picture is not None:
-            along_m, up_m, footprint_m = patch[1:]
-            pictured = face.picture(face.sides_m, along_m, up_m, footprint_m)
-            colour = np.stack(
-                [
-                    np.asarray(part * light, np.float32)
-                    for part, light in zip(pictured, face.lit_bgr, strict=True)
-                ]
-            )
-        kernels.draw_face(window, patch, dirt, face.dirt_scale, waves, face.upright, colour, radiance, hidden)
+    covers = np.empty(len(places), dtype=np.bool_)
+    scales = np.array([face.dirt_scale for face in faces])
+    looks = np.array([face.look for face in faces], dtype=np.float32)
+    for some in _groups(places[bands.rows]):
+        first, end = places[bands.rows[list(some)]]
+        seen = np.empty((4, end - first), dtype=np.float32)
+        drawing.look_at_faces(
+            bands, some, edges, shapes.edge_rows, rays, planes, per_focal, places, seen, covers
+        )
+        waves = np.sin(seen[1:2] * np.float32(2 * np.pi / _CORRUGATION_M))
+        pictures = np.empty((3, end - first if looks[slice(*some), 5].any() else 0), dtype=np.float32)
+        pictured = [number for number in range(*some) if faces[number].picture is not None]
+        for number in pictured:
+            for k in range(*bands.rows[number : number + 2]):
+                part = slice(places[k] - first, places[k + 1] - first)
+                pixels = seen[1:, part].reshape(3, heights[k], widths[k])
+                pictures[:, part] = _pictured(faces[number], pixels)
+        drawing.draw_faces(
+            bands, some, places, covers, seen, waves, pictures, _DIRT_TILE.padded, scales, looks,
+            _rows(radiance), hidden.view(np.uint8),
+        )  # fmt: skip
 
 
-def _plane_of(face: _Face, view: View) -> Float32:
-    """Metres along a face's first and last edge, and the inverse depth, from pinhole pixels (3, 3)."""
-    origin = face.corners_map[0]
+def _pictured(face: _Face, pixels: Float32) -> Float32:
+    """Radiance (3, N) of a face's picture at pixels (3, h, w): metres along both sides, and size."""
+    assert face.picture is not None
+    reflected = face.picture(face.sides_m, *pixels)
+    lit = [np.asarray(part * light, np.float32) for part, light in zip(reflected, face.lit_bgr, strict=True)]
+    return np.stack(lit).reshape(3, -1)
+
+
+def _groups(places: IntArray) -> Iterator[tuple[int, int]]:
+    """The first and end of faces that are drawn together, by where each one's pixels begin (F + 1,)."""
+    first = 0
+    while first < len(places) - 1:
+        end = int(np.searchsorted(places, places[first] + _TOGETHER_PX, side="right")) - 1
+        yield first, (first := max(end, first + 1))
+
+
+def _planes_of(faces: Sequence[_Face], view: View) -> Float32:
+    """Metres along faces' first and last edges, and the inverse depth, from pinhole pixels (F, 3, 3)."""
+    origins = np.array([face.corners_map[0] for face in faces])
+    axes = np.array([face.axes for face in faces])
     rotation = view.cam_from_map[:3, :3]
-    translation = view.cam_from_map[:3, 3]
-    cam_from_face = np.column_stack([rotation @ face.axes, rotation @ origin + translation])
+    cam_from_origin = rotation @ origins[..., None] + view.cam_from_map[:3, 3:]
+    cam_from_face = np.concatenate([rotation @ axes, cam_from_origin], axis=2)
     return np.linalg.inv(view.rays.info.intrinsic @ cam_from_face).astype(np.float32)
 
 
@@ -321,8 +357,8 @@ class Renderer:
         """Write the ground's radiance to ``albedo`` (H', W, 3), which is its reflectance on the way there."""
         scene = self.scene
         bare = on_ground.tone(scene.ground, ground)
-        kernels.spread(bare, np.array(scene.ground.albedo_bgr, dtype=np.float32), albedo)
-        self._paint.draw(view, ground, albedo, labels)
+        kernels.spread(bare, on_ground.float32s(np.array(scene.ground.albedo_bgr)), _rows(albedo))
+        self._paint.draw(view, ground, _rows(albedo), labels)
         sun = on_ground.sun_visibility(shadows, scene.shades, view, ground)
         wet = on_ground.wetness(scene.ground, ground)
         centre = on_ground.float32s(np.append(view.centre_map[:2], view.height_m))
@@ -439,7 +475,7 @@ def _flow(view: View, motion: Motion) -> Float32:
     height, width = rays.u_pinhole_px.shape
     rows, columns = coarse.shape[:2]
     full = cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(full[:height, :width])
+    return np.ascontiguousarray(full[:height, :width], dtype=np.float32)
 
 
 @lru_cache(maxsize=4)

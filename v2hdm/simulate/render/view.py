@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.planar import clip_half
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray, IntArray
-from v2hdm.simulate.render import kernels
+from v2hdm.simulate.render import drawing
 from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.scene import Float32
 
@@ -107,24 +108,30 @@ class View:
         return np.concatenate([points_map, self.relief.height_m(points_map)[..., None]], axis=-1)
 
 
-@dataclass(frozen=True)
-class Outline:
-    """A convex planar polygon as seen.
+class Outlines(NamedTuple):
+    """Convex planar polygons as seen, those in view alone.
 
-    ``edges`` (N, 3) are unit lines in pinhole pixels, positive inside; ``boundary_px`` (M, 2) is its
-    boundary in recorded pixels, clipped to the neighbourhood of the image.
+    ``edges`` (E, 3) are unit lines in pinhole pixels, positive inside; ``boundaries_px`` (M, 2) are their
+    boundaries in recorded pixels, clipped to the neighbourhood of the image. Polygon p is the one of number
+    ``numbers[p]``; its edges begin at ``edge_rows[p]`` (P + 1,), its boundary at ``boundary_rows[p]``.
     """
 
+    numbers: IntArray
     edges: FloatArray
-    boundary_px: FloatArray
+    edge_rows: IntArray
+    boundaries_px: FloatArray
+    boundary_rows: IntArray
 
 
 def outlines(
     view: View, polygons: Sequence[FloatArray], draped: Sequence[FloatArray] | None = None
-) -> list[Outline | None]:
-    """Outlines of polygons of homogeneous pixels (N, 3), None out of view; boundaries those of ``draped``."""
+) -> Outlines | None:
+    """Outlines of polygons of homogeneous pixels (N, 3), None if none is in view.
+
+    Boundaries are those of ``draped``, if given.
+    """
     if not polygons:
-        return []
+        return None
     count = np.array([len(polygon) for polygon in polygons])
     points = np.concatenate(polygons)
     ends = np.cumsum(count)
@@ -137,45 +144,51 @@ def outlines(
     norms = np.hypot(edges[:, 0], edges[:, 1])
     usable = norms > 1e-12
     edges /= np.where(usable, norms, 1.0)[:, None]
-    boundaries = _boundaries(view, parts)
     means = np.add.reduceat(points, ends - count) / count[:, None]
     towards = np.where(usable, (edges * np.repeat(means, count, axis=0)).sum(axis=1), 0.0)
     outward = np.add.reduceat(towards, ends - count) < 0
     edges[np.repeat(outward, count)] *= -1.0
-    usable_counts = np.add.reduceat(usable, ends - count, dtype=np.int64).tolist()
-    shapes: list[Outline | None] = []
-    for number, (part, boundary, end) in enumerate(zip(parts, boundaries, ends.tolist(), strict=True)):
-        if len(part) < 3 or usable_counts[number] < 3:
-            shapes.append(None)
-            continue
-        rows = slice(end - len(polygons[number]), end)
-        lines = edges[rows] if usable_counts[number] == len(polygons[number]) else edges[rows][usable[rows]]
-        shapes.append(Outline(lines, boundary))
-    return shapes
+    usable_counts = np.add.reduceat(usable, ends - count, dtype=np.int64)
+    size = np.array([len(part) for part in parts])
+    is_seen = (size >= 3) & (usable_counts >= 3)
+    if not is_seen.any():
+        return None
+    numbers = np.flatnonzero(is_seen)
+    boundaries_px, boundary_sizes = _boundaries(view, [parts[number] for number in numbers])
+    return Outlines(
+        numbers,
+        edges[usable & np.repeat(is_seen, count)],
+        begins(usable_counts[numbers]),
+        boundaries_px,
+        begins(boundary_sizes),
+    )
 
 
-def _boundaries(view: View, parts: Sequence[FloatArray]) -> list[FloatArray]:
-    """Boundaries (M, 2) of visible parts (N, 3) in recorded pixels, with points along long sides."""
+def begins(sizes: ArrayLike) -> IntArray:
+    """Where each of several parts (P,) in one array begins, and the last one's end (P + 1,)."""
+    return np.concatenate([[0], np.cumsum(sizes)])
+
+
+def _boundaries(view: View, parts: Sequence[FloatArray]) -> tuple[FloatArray, IntArray]:
+    """Boundaries (M, 2) px, as recorded, of visible parts (N, 3), and their sizes; long sides have points."""
     size = np.array([len(part) for part in parts])
     ends = np.cumsum(size)
+    first = ends - size
     corners = np.concatenate(parts)
     corners_px = corners[:, :2] / corners[:, 2:]
-    begin = (ends - size)[size > 0]
-    extent_px = np.zeros(len(parts))
-    if len(begin):
-        extents_px = np.maximum.reduceat(corners_px, begin) - np.minimum.reduceat(corners_px, begin)
-        extent_px[size > 0] = extents_px.max(axis=1)
-    more = np.minimum(extent_px / 40.0, 8.0).astype(np.int64)  # points of a side besides its first
+    extents_px = np.maximum.reduceat(corners_px, first) - np.minimum.reduceat(corners_px, first)
+    more = np.minimum(extents_px.max(axis=1) / 40.0, 8.0).astype(
+        np.int64
+    )  # points of a side beyond its first
     following = np.arange(1, len(corners) + 1)
-    following[ends[size > 0] - 1] = begin
+    following[ends - 1] = first
     points = np.repeat(more, size) + 1  # of each side
     last = np.cumsum(points)
-    number = np.arange(last[-1] if len(last) else 0) - np.repeat(last - points, points)
+    number = np.arange(last[-1]) - np.repeat(last - points, points)
     share = _STEPS[np.repeat(points - 1, points), number][:, None]
     first_px = np.repeat(corners_px, points, axis=0)
     along_px = np.repeat(corners_px[following] - corners_px, points, axis=0)
-    boundaries = distort_points(view.rays.info, first_px + share * along_px)
-    return np.split(boundaries, np.cumsum(size * (more + 1))[:-1])
+    return distort_points(view.rays.info, first_px + share * along_px), size * (more + 1)
 
 
 def in_view(view: View, homogeneous_px: FloatArray, farthest_m: float) -> NDArray[np.intp]:
@@ -197,36 +210,47 @@ def following_row(array: FloatArray) -> FloatArray:
 
 def _visible_parts(view: View, polygons: Sequence[FloatArray]) -> list[FloatArray]:
     """The parts (M, 3) of homogeneous polygons in front of and near the image."""
-    begins = np.cumsum([0, *(len(polygon) for polygon in polygons[:-1])])
+    first = begins([len(polygon) for polygon in polygons])[:-1]
     u0, v0, u1, v1 = view.rays.bounds
     sides = [[1.0, 0.0, _MARGIN_PX - u0], [-1.0, 0.0, u1 + _MARGIN_PX]]
     sides += [[0.0, 1.0, _MARGIN_PX - v0], [0.0, -1.0, v1 + _MARGIN_PX]]
     limits = np.array([[0.0, 0.0, 1.0], *sides])
     least = (NEAR_M, 0.0, 0.0, 0.0, 0.0)
     inside = np.concatenate(polygons) @ limits.T >= least
-    whole = np.all(np.logical_and.reduceat(inside, begins), axis=1).tolist()
-    in_reach = np.all(np.logical_or.reduceat(inside, begins), axis=1).tolist()
+    whole = np.all(np.logical_and.reduceat(inside, first), axis=1).tolist()
+    in_reach = np.all(np.logical_or.reduceat(inside, first), axis=1).tolist()
     parts = [polygon if reaches else polygon[:0] for polygon, reaches in zip(polygons, in_reach, strict=True)]
-    for k in [k for k in range(len(parts)) if not whole[k]]:
+    for k in [k for k in range(len(parts)) if in_reach[k] and not whole[k]]:
         for line, level in zip(limits, least, strict=True):
             parts[k] = clip_half(parts[k], parts[k] @ line - level)
     return parts
 
 
-def bands_of(view: View, shape: Outline, first_row: int = 0) -> tuple[IntArray, int]:
-    """Image windows that cover an outline closely, bands of rows as wide as it is there, and their number."""
+class Bands(NamedTuple):
+    """Image windows (K, 4) that cover outlines closely; those of outline p begin at ``rows[p]`` (P + 1,)."""
+
+    windows: IntArray
+    rows: IntArray
+
+
+def bands_of(view: View, shapes: Outlines, first_row: int = 0) -> Bands:
+    """Bands of image rows as wide as outlines are there."""
     height, width = view.rays.u_pinhole_px.shape
-    windows = np.empty((height // _BAND_ROWS + 2, 4), dtype=np.int64)
+    count = len(shapes.numbers)
+    windows = np.empty((count * (height // _BAND_ROWS + 2), 4), dtype=np.int64)
+    rows = np.zeros(count + 1, dtype=np.int64)
     limits = (_BAND_ROWS, _BAND_AREA_PX)
-    return windows, kernels.bands(shape.boundary_px, first_row, height, width, limits, windows)
+    bounds = (first_row, height, width)
+    drawing.bands(shapes.boundaries_px, shapes.boundary_rows, bounds, limits, windows, rows)
+    return Bands(windows[: rows[-1]], rows)
 
 
-def edges_of(shape: Outline, grown_px: float = 0.0) -> Float32:
-    """Lines (N, 3) for kernels, whose value at a pixel is the share of it that the edge leaves, from 0 to 1.
+def edges_of(shapes: Outlines, grown_px: float = 0.0) -> Float32:
+    """Lines (E, 3) for kernels, whose value at a pixel is the share of it that the edge leaves, from 0 to 1.
 
     An edge covers ``clip(1/2 + d)`` of a pixel at signed distance d. Opposite edges of a quadrilateral add up
     (so a strip narrower than a pixel keeps its area), neighbouring ones multiply; with other numbers of
     edges what each cuts off is added. ``grown_px`` pushes every edge outwards, which closes the seam between
     faces that share one.
     """
-    return np.add(shape.edges, [0.0, 0.0, 0.5 + grown_px], dtype=np.float64).astype(np.float32)
+    return np.add(shapes.edges, [0.0, 0.0, 0.5 + grown_px], dtype=np.float64).astype(np.float32)
