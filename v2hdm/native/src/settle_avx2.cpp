@@ -1,4 +1,4 @@
-// The steps once more with the instructions of newer x86 processors: in 60 % of the time.
+// The steps once more with the instructions of newer x86 processors.
 #include "settle.h"
 
 #include <algorithm>

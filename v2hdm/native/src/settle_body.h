@@ -3,6 +3,8 @@ namespace v2hdm {
 namespace {
 
 constexpr int BLOCK = 16;         // pixels that are worked on together; a row of a buffer is padded to these
+constexpr int LANES = 8;          // sums that are taken side by side
+constexpr int BINS = 64;          // places along a marking that pixels are put in order by
 constexpr int MEDIAN_STRIDE = 3;  // lattice.py: a median is taken over every third value
 constexpr float FAR_BLURS = 5.0f; // blurs from a side beyond which it changes nothing: its density is 1.5e-6
 constexpr float LOG_SQRT_2PI = 0.91893853f;
@@ -50,6 +52,11 @@ class Fit {
         for (int s = 0; s < SIDES; ++s) copy(pixels.of_side + s * pixels.stride, OF_SIDE + s);
         for (int k = 0; k < KNOTS; ++k) copy(pixels.hats + k * pixels.stride, HATS + k);
         if (pixels.paint != nullptr) copy(pixels.paint, PAINT);
+        near_.resize(row_ / BLOCK);
+        lit_.assign(row_ / BLOCK, 0);
+        for (int i = 0; i < row_; ++i) {
+            for (int k = 0; k < KNOTS; ++k) lit_[i / BLOCK] |= (row(HATS + k)[i] != 0.0f) << k;
+        }
     }
 
     void step(Unknowns& unknowns, double least_scatter, Equations& equations) {
@@ -61,7 +68,6 @@ class Fit {
         Matrix information;
         Vector gradient;
         square(*unknowns.contrast, information, gradient);
-        if (pixels_.paint != nullptr) add_paint(information, gradient);
         add_priors(quad, unknowns, information, gradient);
         Vector step;
         std::copy(gradient, gradient + UNKNOWNS, step);
@@ -94,16 +100,29 @@ class Fit {
         for (int i = 0; i < count_; ++i) to[i] = from[order_[i]];
     }
 
-    // Put the pixels that are used in order of their sides: most blocks of them are far from the three others.
+    // Put the pixels that are used in order of their sides, and along the marking: near most blocks of them there
+    // are one side and few knots.
     void arrange() {
-        std::vector<int32_t> of_side[SIDES + 1];
+        std::vector<float> along(pixels_.count, 0.0f);  // in knots
+        for (int k = 1; k < KNOTS; ++k) {
+            const float* hat = pixels_.hats + static_cast<int64_t>(k) * pixels_.stride;
+            for (int i = 0; i < pixels_.count; ++i) along[i] += k * hat[i];
+        }
+        constexpr float PER_KNOT = static_cast<float>(BINS) / (KNOTS - 1);
+        int32_t ends[(SIDES + 1) * BINS + 1] = {};
+        std::vector<int32_t> bin(pixels_.count, NOWHERE);
         for (int i = 0; i < pixels_.count; ++i) {
             if (pixels_.use[i] == 0.0f) continue;
             int side = 0;
             while (side < SIDES && !(pixels_.of_side[side * pixels_.stride + i] > 0)) ++side;
-            of_side[side].push_back(i);
+            bin[i] = side * BINS + static_cast<int>(least(most(along[i] * PER_KNOT, 0.0f), BINS - 1));
+            ++ends[bin[i] + 1];
         }
-        for (const auto& pixels : of_side) order_.insert(order_.end(), pixels.begin(), pixels.end());
+        for (int b = 0; b < (SIDES + 1) * BINS; ++b) ends[b + 1] += ends[b];
+        order_.resize(ends[(SIDES + 1) * BINS]);
+        for (int i = 0; i < pixels_.count; ++i) {
+            if (bin[i] != NOWHERE) order_[ends[bin[i]]++] = i;
+        }
         count_ = static_cast<int>(order_.size());
         std::vector<int32_t> place(pixels_.count, NOWHERE);
         for (int32_t i = 0; i < count_; ++i) place[order_[i]] = i;
@@ -150,70 +169,91 @@ class Fit {
         const float* y = row(Y) + begin;
         float inside[BLOCK], coverage[BLOCK] = {}, by_blur[BLOCK] = {};
         std::fill(inside, inside + BLOCK, 1.0f);
+        int near_sides = 0;
         for (int s = 0; s < SIDES; ++s) {
             float across[BLOCK], start[BLOCK], end[BLOCK];
-            int near = 0;
             for (int i = 0; i < BLOCK; ++i) {
                 across[i] = matrix[0][s][0] * x[i] + matrix[0][s][1] * y[i] + matrix[0][s][2];
                 start[i] = matrix[1][s][0] * x[i] + matrix[1][s][1] * y[i] + matrix[1][s][2];
                 end[i] = matrix[2][s][0] * x[i] + matrix[2][s][1] * y[i] + matrix[2][s][2];
                 inside[i] = across[i] < 0.0f ? inside[i] : 0.0f;
             }
-            for (int i = 0; i < BLOCK; ++i) near |= (across[i] < FAR_BLURS) & (across[i] > -FAR_BLURS);
-            float* by_start = row(BY_SHAPE + s) + begin;
-            float* by_end = row(BY_SHAPE + SIDES + s) + begin;
-            if (near == 0) {
-                std::fill(by_start, by_start + BLOCK, 0.0f);
-                std::fill(by_end, by_end + BLOCK, 0.0f);
-                continue;
-            }
+            if (whereabouts(across) != 0) continue;
+            const int of_start = whereabouts(start), of_end = whereabouts(end);
+            if (of_start != 0 && of_start == of_end) continue;
+            near_sides |= 1 << s;
+            const Seen from = see(across, start, of_start), to = see(across, end, of_end);
+            float by_start[BLOCK], by_end[BLOCK];
             for (int i = 0; i < BLOCK; ++i) {
                 const float density = normal_pdf(across[i]) * per_blur;
-                const float share = normal_share(end[i]) - normal_share(start[i]);
-                const float at_end = (normal_pdf(start[i]) - normal_pdf(end[i]) - start[i] * share) * per_length[s];
+                const float share = to.share[i] - from.share[i];
+                const float at_end = (from.density[i] - to.density[i] - start[i] * share) * per_length[s];
                 by_end[i] = density * at_end;
                 by_blur[i] += density * share * across[i];
                 by_start[i] = density * share - by_end[i];
+                const float beyond = to.triangle[i] - from.triangle[i];
+                coverage[i] += across[i] < 0.0f ? -beyond : beyond;
             }
-            add_triangles(across, start, end, coverage);
+            std::copy_n(by_start, BLOCK, row(BY_SHAPE + s) + begin);
+            std::copy_n(by_end, BLOCK, row(BY_SHAPE + SIDES + s) + begin);
         }
-        std::copy(by_blur, by_blur + BLOCK, row(BY_SHAPE + BLUR) + begin);
-        float* covered = row(COVERAGE) + begin;
-        for (int i = 0; i < BLOCK; ++i) covered[i] = coverage[i] + inside[i];
+        near_[begin / BLOCK] = near_sides;
+        std::copy_n(by_blur, BLOCK, row(BY_SHAPE + BLUR) + begin);
+        for (int i = 0; i < BLOCK; ++i) coverage[i] += inside[i];
+        std::copy_n(coverage, BLOCK, row(COVERAGE) + begin);
     }
 
-    // Add the mass between pixels and a side's line, from its start to its end: T(h, end) - T(h, start).
-    void add_triangles(const float* across, const float* start, const float* end, float* coverage) const {
+    // 1 or -1 if all of a block is so far on that side of 0, in blurs, that nothing changes any more; else 0.
+    static int whereabouts(const float (&at)[BLOCK]) {
+        int above = 0, below = 0;
+        for (int i = 0; i < BLOCK; ++i) {
+            above += at[i] >= FAR_BLURS;
+            below += at[i] <= -FAR_BLURS;
+        }
+        return (above == BLOCK) - (below == BLOCK);
+    }
+
+    // How pixels see one end of a side: the normal's share and density there, and T(h, end).
+    struct Seen {
+        float share[BLOCK], density[BLOCK], triangle[BLOCK];
+    };
+
+    // The same of a block for which the end is ``where`` whereabouts() says.
+    Seen see(const float (&across)[BLOCK], const float (&end)[BLOCK], int where) const {
+        Seen seen;
         const float cells = table_.cells_per_blur;
         const float last_row = cells * table_.reach - 1.01f, last_column = cells * table_.reach * 2 - 1.01f;
-        int32_t at_start[BLOCK], at_end[BLOCK];
-        float down[BLOCK], right_of_start[BLOCK], right_of_end[BLOCK];
+        int32_t place[BLOCK];
+        float down[BLOCK], right[BLOCK];
         for (int i = 0; i < BLOCK; ++i) {
             const float size = across[i] < 0.0f ? -across[i] : across[i];
             const float v = least(most(size * cells, 0.0f), last_row);
-            const float u_start = least(most((start[i] + table_.reach) * cells, 0.0f), last_column);
-            const float u_end = least(most((end[i] + table_.reach) * cells, 0.0f), last_column);
-            const int32_t row = static_cast<int32_t>(v);
-            const int32_t start_column = static_cast<int32_t>(u_start), end_column = static_cast<int32_t>(u_end);
-            at_start[i] = row * table_.columns + start_column;
-            at_end[i] = row * table_.columns + end_column;
+            const float u = least(most((end[i] + table_.reach) * cells, 0.0f), last_column);
+            const int32_t row = static_cast<int32_t>(v), column = static_cast<int32_t>(u);
+            place[i] = row * table_.columns + column;
             down[i] = v - static_cast<float>(row);
-            right_of_start[i] = u_start - static_cast<float>(start_column);
-            right_of_end[i] = u_end - static_cast<float>(end_column);
+            right[i] = u - static_cast<float>(column);
+        }
+        if (where != 0) {
+            std::fill_n(seen.share, BLOCK, 0.5f * where);
+            std::fill_n(seen.density, BLOCK, 0.0f);
+            for (int i = 0; i < BLOCK; ++i) {
+                const float upper = table_.values[place[i]], lower = table_.values[place[i] + table_.columns];
+                seen.triangle[i] = upper + down[i] * (lower - upper);
+            }
+            return seen;
         }
         for (int i = 0; i < BLOCK; ++i) {
-            const float beyond =
-                read(at_end[i], right_of_end[i], down[i]) - read(at_start[i], right_of_start[i], down[i]);
-            coverage[i] += across[i] < 0.0f ? -beyond : beyond;
+            seen.share[i] = normal_share(end[i]);
+            seen.density[i] = normal_pdf(end[i]);
         }
-    }
-
-    float read(int32_t place, float right, float down) const {
-        const float* above = table_.values + place;
-        const float* below = above + table_.columns;
-        const float upper = above[0] + right * (above[1] - above[0]);
-        const float lower = below[0] + right * (below[1] - below[0]);
-        return upper + down * (lower - upper);
+        for (int i = 0; i < BLOCK; ++i) {
+            const float *above = table_.values + place[i], *below = above + table_.columns;
+            const float upper = above[0] + right[i] * (above[1] - above[0]);
+            const float lower = below[0] + right[i] * (below[1] - below[0]);
+            seen.triangle[i] = upper + down[i] * (lower - upper);
+        }
+        return seen;
     }
 
     // Light and contrast of least squares, the logarithm taken as linear in the coverage.
@@ -244,21 +284,24 @@ class Fit {
     void explain(const Unknowns& unknowns) {
         const float gain = std::exp(static_cast<float>(*unknowns.contrast)) - 1;
         const float slope = static_cast<float>(*unknowns.slope);
-        float* model = row(SCRATCH);
-        std::fill(model, model + row_, 0.0f);
-        for (int k = 0; k < KNOTS; ++k) {
-            const float light = static_cast<float>(unknowns.light[k]);
-            const float* hat = row(HATS + k);
-            for (int i = 0; i < row_; ++i) model[i] += light * hat[i];
+        for (int begin = 0; begin < row_; begin += BLOCK) {
+            const float *coverage = row(COVERAGE) + begin, *values = row(VALUES) + begin;
+            const float *across = row(ACROSS) + begin, *use = row(USE) + begin;
+            float light[BLOCK] = {}, ratio[BLOCK], residual[BLOCK];
+            for (int k = 0; k < KNOTS; ++k) {
+                const float at_knot = static_cast<float>(unknowns.light[k]);
+                const float* hat = row(HATS + k) + begin;
+                for (int i = 0; i < BLOCK; ++i) light[i] += at_knot * hat[i];
+            }
+            for (int i = 0; i < BLOCK; ++i) {
+                ratio[i] = 1 + gain * least(most(coverage[i], 0.0f), 1.0f);
+                residual[i] = (values[i] - (light[i] + slope * across[i] + logarithm(ratio[i]))) * ratio[i];
+            }
+            std::copy_n(ratio, BLOCK, row(RATIO) + begin);
+            std::copy_n(residual, BLOCK, row(RESIDUAL) + begin);
+            std::copy_n(use, BLOCK, row(USED) + begin);
         }
-        const float *coverage = row(COVERAGE), *values = row(VALUES), *across = row(ACROSS), *use = row(USE);
-        float *ratio = row(RATIO), *residual = row(RESIDUAL), *used = row(USED);
-        for (int i = 0; i < row_; ++i) {
-            ratio[i] = 1 + gain * least(most(coverage[i], 0.0f), 1.0f);
-            const float expected = model[i] + slope * across[i] + logarithm(ratio[i]);
-            residual[i] = (values[i] - expected) * ratio[i];
-            used[i] = use[i];
-        }
+        float *residual = row(RESIDUAL), *used = row(USED);
         // Where the sensor was at its limit the truth is as bright or brighter.
         for (const int32_t i : limited_) {
             if (residual[i] < 0) used[i] = 0.0f;
@@ -326,65 +369,92 @@ class Fit {
         return total;
     }
 
-    // The normal equations of the weighted residuals.
+    // Sums of products, each of every LANES-th pixel, of the unknowns' derivatives and, last, of residuals.
+    using Sums = float[UNKNOWNS + 1][UNKNOWNS + 1][LANES];
+
+    // The normal equations of the weighted residuals, and of those of the paint; robust.add_paint.
     void square(double contrast, Matrix& information, Vector& gradient) {
-        double sums[UNKNOWNS + 1][UNKNOWNS + 1] = {};
-        float design[UNKNOWNS + 1][CHUNK];
-        for (int begin = 0; begin < row_; begin += CHUNK) {
-            const int count = std::min(CHUNK, row_ - begin);
-            derive(contrast, begin, count, design);
-            std::copy_n(row(RESIDUAL) + begin, count, design[UNKNOWNS]);
-            add_products(design, row(WEIGHT) + begin, count, sums);
-        }
-        for (int u = 0; u < UNKNOWNS; ++u) {
-            for (int other = 0; other <= u; ++other) information[u][other] = information[other][u] = sums[u][other];
-            gradient[u] = sums[UNKNOWNS][u];
-        }
-    }
-
-    // The derivatives of ``count`` residuals from ``begin`` on by the unknowns.
-    void derive(double contrast, int begin, int count, float (&design)[UNKNOWNS + 1][CHUNK]) {
         const float gain = std::exp(static_cast<float>(contrast)) - 1;
-        const float *coverage = row(COVERAGE) + begin, *ratio = row(RATIO) + begin, *across = row(ACROSS) + begin;
-        for (int u = 0; u <= BLUR; ++u) {
-            const float* by_shape = row(BY_SHAPE + u) + begin;
-            for (int i = 0; i < count; ++i) design[u][i] = by_shape[i] * gain;
-        }
-        for (int k = 0; k < KNOTS; ++k) {
-            const float* hat = row(HATS + k) + begin;
-            for (int i = 0; i < count; ++i) design[LIGHT + k][i] = hat[i] * ratio[i];
-        }
-        for (int i = 0; i < count; ++i) {
-            design[CONTRAST][i] = (gain + 1) * coverage[i];
-            design[SLOPE][i] = across[i] * ratio[i];
+        Sums sums = {};
+        for (int begin = 0; begin < row_; begin += BLOCK) add_block(begin, gain, sums);
+        double factor[UNKNOWNS];
+        std::fill(factor, factor + UNKNOWNS, 1.0);
+        std::fill(factor, factor + BLUR + 1, gain);
+        factor[CONTRAST] = gain + 1;
+        for (int u = 0; u < UNKNOWNS; ++u) {
+            for (int other = 0; other <= u; ++other) {
+                const double of_pair = u < BLUR ? 1.0 : factor[u] * factor[other];
+                information[u][other] = information[other][u] = of_pair * sum(sums[u][other], LANES);
+            }
+            gradient[u] = (u < BLUR ? 1.0 : factor[u]) * sum(sums[UNKNOWNS][u], LANES);
         }
     }
 
-    // Add that the network's probability of paint is the coverage; robust.add_paint.
-    void add_paint(Matrix& information, Vector& gradient) {
-        const float *paint = row(PAINT), *coverage = row(COVERAGE), *use = row(USE);
+    // Add the products of a block: of sides with their final weight, all else as if contrast's factors were 1.
+    void add_block(int begin, float gain, Sums& sums) {
+        float light[KNOTS + 1][BLOCK];
+        const float* rows[UNKNOWNS];
+        int unknown[UNKNOWNS], count = 0;
+        const int near_sides = near_[begin / BLOCK], lit = lit_[begin / BLOCK];
+        const float *coverage = row(COVERAGE) + begin, *ratio = row(RATIO) + begin, *across = row(ACROSS) + begin;
+        for (int u = 0; u < BLUR; ++u) {
+            if (near_sides >> u % SIDES & 1) unknown[count++] = u;
+        }
+        if (near_sides != 0) unknown[count++] = BLUR;
+        for (int n = 0; n < count; ++n) rows[n] = row(BY_SHAPE + unknown[n]) + begin;
+        rows[count] = coverage;
+        unknown[count++] = CONTRAST;
+        for (int k = 0; k < KNOTS; ++k) {
+            if (!(lit >> k & 1)) continue;
+            const float* hat = row(HATS + k) + begin;
+            for (int i = 0; i < BLOCK; ++i) light[k][i] = hat[i] * ratio[i];
+            rows[count] = light[k];
+            unknown[count++] = LIGHT + k;
+        }
+        for (int i = 0; i < BLOCK; ++i) light[KNOTS][i] = across[i] * ratio[i];
+        rows[count] = light[KNOTS];
+        unknown[count++] = SLOPE;
+
+        const float *weight = row(WEIGHT) + begin, *residual = row(RESIDUAL) + begin;
+        float of_sides[BLOCK], pull[BLOCK], pull_of_sides[BLOCK];
+        for (int i = 0; i < BLOCK; ++i) {
+            pull[i] = weight[i] * residual[i];
+            of_sides[i] = gain * gain * weight[i];
+            pull_of_sides[i] = gain * pull[i];
+        }
+        if (pixels_.paint != nullptr) add_paint(begin, of_sides, pull_of_sides);
+        for (int n = 0; n < count; ++n) {
+            const int u = unknown[n];
+            const float* of_pixel = u < BLUR ? of_sides : weight;
+            float weighted[BLOCK];
+            for (int i = 0; i < BLOCK; ++i) weighted[i] = rows[n][i] * of_pixel[i];
+            for (int m = 0; m <= n; ++m) add_products(weighted, rows[m], sums[u][unknown[m]]);
+            add_products(rows[n], u < BLUR ? pull_of_sides : pull, sums[UNKNOWNS][u]);
+        }
+    }
+
+    // Add to weights, and to weighted residuals, of sides that the network's probability of paint is the coverage.
+    void add_paint(int begin, float (&of_sides)[BLOCK], float (&pull_of_sides)[BLOCK]) {
+        const float *paint = row(PAINT) + begin, *coverage = row(COVERAGE) + begin, *use = row(USE) + begin;
         const float per_sigma = static_cast<float>(1 / (rules_.cauchy * rules_.paint_sigma));
         const float per_variance = static_cast<float>(1 / (rules_.paint_sigma * rules_.paint_sigma));
-        double sums[BLUR + 1][BLUR + 1] = {};
-        float design[BLUR + 1][CHUNK], weight[CHUNK];
-        float* residual = design[BLUR];
-        for (int begin = 0; begin < row_; begin += CHUNK) {
-            const int count = std::min(CHUNK, row_ - begin);
-            for (int u = 0; u < BLUR; ++u) std::copy_n(row(BY_SHAPE + u) + begin, count, design[u]);
-            for (int i = 0; i < count; ++i) {
-                residual[i] = paint[begin + i] - coverage[begin + i];
-                const float size = residual[i] * per_sigma;
-                weight[i] = use[begin + i] * per_variance / (1 + size * size);
-            }
-            add_products(design, weight, count, sums);
+        for (int i = 0; i < BLOCK; ++i) {
+            const float residual = paint[i] - coverage[i];
+            const float size = residual * per_sigma;
+            const float weight = use[i] * per_variance / (1 + size * size);
+            of_sides[i] += weight;
+            pull_of_sides[i] += weight * residual;
         }
-        for (int u = 0; u < BLUR; ++u) {
-            for (int other = 0; other <= u; ++other) {
-                information[u][other] += sums[u][other];
-                if (other < u) information[other][u] += sums[u][other];
-            }
-            gradient[u] += sums[BLUR][u];
+    }
+
+    // Add the products of a block's numbers.
+    static void add_products(const float* a, const float* b, float (&sums)[LANES]) {
+        float totals[LANES];
+        std::copy_n(sums, LANES, totals);
+        for (int begin = 0; begin < BLOCK; begin += LANES) {
+            for (int i = 0; i < LANES; ++i) totals[i] += a[begin + i] * b[begin + i];
         }
+        std::copy_n(totals, LANES, sums);
     }
 
     // Add the outline, the typical blur and contrast, and that light changes little; State._add_priors.
@@ -470,6 +540,8 @@ class Fit {
     std::vector<std::vector<Pair>> pairs_;     // places of neighbours, by axis
     int row_ = 0;                              // floats from one row of the buffer to the next
     std::vector<float> buffer_;
+    std::vector<int32_t> near_;                // sides that a block is near, by bits
+    std::vector<int32_t> lit_;                 // knots whose light a block is in, by bits
 };
 
 }  // namespace
