@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from v2hdm.geometry.least_squares import Normal, gauss_newton, normal_equations
+from v2hdm.geometry.least_squares import Normal, first_of_inverse, gauss_newton, normal_equations
 from v2hdm.geometry.rigid import exp, inverse, log
 
 AT = np.linspace(0.0, 2.0, 30)
@@ -108,3 +108,12 @@ def test_steps_are_limited_and_counted():
     fit = gauss_newton(linearise, np.zeros(1), limit=lambda step: np.clip(step, -3.0, 3.0))
     assert fit.steps == 5  # 3, 3, 3, 1 and one of nothing
     np.testing.assert_allclose(fit.x, 10.0)
+
+
+@pytest.mark.parametrize("least", [1.0, -1.0])
+def test_the_first_of_an_inverse_is_a_corner_of_it_definite_or_not(least):
+    axes = np.linalg.qr(np.random.default_rng(3).normal(size=(30, 30)))[0]
+    information = axes * np.r_[least, np.linspace(1.0, 1e4, 29)] @ axes.T
+    np.testing.assert_allclose(
+        first_of_inverse(information, 7), np.linalg.inv(information)[:7, :7], rtol=1e-8
+    )

@@ -141,6 +141,15 @@ def covariance_of(information: FloatArray) -> FloatArray:
     return np.asarray((axes / values) @ axes.T / np.outer(scale, scale))
 
 
+def first_of_inverse(information: FloatArray, count: int) -> FloatArray:
+    """The first rows and columns (count, count) of the inverse of an information matrix (U, U)."""
+    scale, scaled = _scaled(information)
+    is_definite, solved = cv2.solve(scaled, np.eye(len(scale), count), flags=cv2.DECOMP_CHOLESKY)
+    if not is_definite:
+        solved = np.linalg.inv(scaled)
+    return np.asarray(solved[:count, :count] / np.outer(scale[:count], scale[:count]))
+
+
 def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Scales (U,), and the information matrix scaled to a diagonal of 1, or 0."""
     diagonal = np.diag(information)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.geometry.least_squares import Normal, gauss_newton
+from v2hdm.geometry.least_squares import Normal, first_of_inverse, gauss_newton
 from v2hdm.geometry.planar import cross
 from v2hdm.geometry.rigid import rotation_from_vector
 from v2hdm.ground.model import GroundHits, Mount, by_lens, by_pixel, hit_ground
@@ -58,7 +58,8 @@ class Adjusted:
     fall to both sides of the path, m per m. ``poses`` (I, 4, 4) are ``map_from_vehicle`` with their errors
     and the parameter applied. ``residual`` (N,) is the norm over both pixels in units of :data:`PIXEL_SIGMA`,
     ``weight`` (N,) its Cauchy weight. ``data_variance`` (K,) is the part of the variances from matches and
-    poses, ``stretch_variance`` (K,) the same, clustered by segments of the route.
+    poses, ``stretch_variance`` (K,) the same, clustered by segments of the route. ``sigma_px`` is the
+    standard deviation of the pixels.
     """
 
     mount: Mount
@@ -72,6 +73,7 @@ class Adjusted:
     weight: FloatArray
     data_variance: FloatArray
     stretch_variance: FloatArray
+    sigma_px: float
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,18 @@ class Errors(NamedTuple):
     def of(cls, solution: Adjusted, images: IntArray) -> Errors:
         """The errors of a solution, of some of its ``images`` (I,)."""
         return cls(solution.pose_errors[images], solution.bends, solution.roof)
+
+
+class _Side(NamedTuple):
+    """One side of N matches on the ground."""
+
+    image: IntArray  # (N,)
+    px: FloatArray  # (N, 2) that the rays go through
+    hits: GroundHits
+    by_px: FloatArray  # (N, 2, 2) of the ground points
+    terms: FloatArray  # (N, 6) of the smooth pixel error
+    falling: FloatArray  # (N, 2) by the road's fall
+    points_map: FloatArray  # (N, 2) m
 
 
 class _Differences(NamedTuple):
@@ -142,7 +156,7 @@ def adjust(
     if without is not None:
         begin = _Unknowns(without.mount, 0.0, without.pose_errors, without.bends, without.roof)
         damping = _DAMPING
-        problem = replace(problem, sigma_px=problem.linearise(begin).sigma_px)
+        problem = replace(problem, sigma_px=without.sigma_px)
     fit = gauss_newton(
         problem.linearise, begin, retract=problem.moved, limit=_short, steps=_STEPS, tolerance=_CONVERGED,
         damping=damping,
@@ -150,12 +164,11 @@ def adjust(
     unknowns = fit.x
     last = fit.last
     reported = [*range(6), *range(_ROOF + 1, problem.shared)]
-    inverse = np.linalg.inv(last.information)
-    of_shared = inverse[: problem.shared, : problem.shared]
+    of_shared = first_of_inverse(last.information, problem.shared)
     return Adjusted(
         mount=unknowns.mount,
         extra=unknowns.extra,
-        covariance=np.asarray(inverse[np.ix_(reported, reported)]),
+        covariance=of_shared[np.ix_(reported, reported)],
         pose_errors=unknowns.errors,
         bends=unknowns.bends,
         roof=unknowns.roof,
@@ -164,6 +177,7 @@ def adjust(
         weight=last.weight,
         data_variance=(np.diag(of_shared) - of_shared**2 @ problem.stiffness)[reported],
         stretch_variance=_by_stretch(last.score @ of_shared, observations.first)[reported],
+        sigma_px=last.sigma_px,
     )
 
 
@@ -273,63 +287,55 @@ class _Problem:
         cost = -0.5 * far**2 * float(np.log(weight[good]).sum()) + prior_cost
         return _Weighted(information, gradient, cost, length, weight, score, sigma_px)
 
-    def _differences(self, now: _Unknowns, noise_px: Sequence[FloatArray] | None = None) -> _Differences:
+    def _differences(self, now: _Unknowns) -> _Differences:
         """The differences of the matches' ground points.
 
         Once the noise is known they are linearised at pixels with the most likely noise removed. Jacobians at
         observed pixels correlate with the noise: over thousands of matches, focal lengths come out up to 1 %
         too long (Pope, Some pitfalls to be avoided in the iterative adjustment of nonlinear problems, 1972).
         """
-        observations = self.observations
         poses = self.poses(now)
-        points = []
-        by_shared = []
-        by_pose = []
-        slopes = []
-        spread = np.zeros((len(observations.first), 2, 2))
-        removed_px = noise_px or (0 * observations.first_px,) * 2
-        halves = _halves(observations)
-        for half, off_px, lower_m in zip(halves, removed_px, self.lower_m, strict=True):
-            px = half.px - off_px
-            half_poses = poses[half.image]
-            hits = hit_ground(now.mount, px, half_poses)
-            by_px = by_pixel(now.mount, hits)
-            bending = _bending(now.mount, px, by_px)
-            falling = hits.by_fall(lower_m)
-            columns = [hits.by_mount(), bending, falling[:, :, None]]
-            if self.free is not None:
-                by_parameter = self._by_parameter(now.mount, hits, px, half_poses, half.image)
-                columns.append(by_parameter[:, :, None])
-            by_noise = (by_px @ off_px[:, :, None])[..., 0]
-            points.append(hits.points_map + bending @ now.bends + now.roof * falling + by_noise)
-            by_shared.append(np.concatenate(columns, axis=2))
-            by_pose.append(hits.by_pose())
-            slopes.append(by_px)
-            blur = PIXEL_SIGMA * by_px
-            spread = spread + blur @ np.swapaxes(blur, 1, 2)
-        usable = np.isfinite(spread).all(axis=(1, 2))
-        root = np.full(spread.shape, np.nan)
-        root[usable] = np.linalg.inv(np.linalg.cholesky(spread[usable]))
-        if self.sigma_px is not None and noise_px is None:
-            whitened = root @ (points[0] - points[1])[:, :, None]
+        sides = self._sides(now, poses, (0 * self.observations.first_px,) * 2)
+        root = _whitening(sides)
+        if self.sigma_px is not None:
+            whitened = root @ (sides[0].points_map - sides[1].points_map)[:, :, None]
             pull = PIXEL_SIGMA**2 * np.nan_to_num(np.swapaxes(root, 1, 2) @ whitened)
-            likeliest = (np.swapaxes(np.nan_to_num(by_px), 1, 2) @ pull for by_px in (slopes[0], -slopes[1]))
+            slopes = (sides[0].by_px, -sides[1].by_px)
+            likeliest = ((np.swapaxes(np.nan_to_num(by_px), 1, 2) @ pull)[..., 0] for by_px in slopes)
             limit_px = _LARGEST_NOISE_PX
-            return self._differences(
-                now, [np.clip(noise[..., 0], -limit_px, limit_px) for noise in likeliest]
-            )
-        jacobian = np.concatenate([by_shared[0] - by_shared[1], by_pose[0], -by_pose[1]], axis=2)
-        return _Differences(points[0] - points[1], jacobian, root)
+            sides = self._sides(now, poses, [np.clip(noise, -limit_px, limit_px) for noise in likeliest])
+            root = _whitening(sides)
+        first, second = sides
+        by_shared = self._by_shared(now, poses, first) - self._by_shared(now, poses, second)
+        jacobian = np.concatenate([by_shared, first.hits.by_pose(), -second.hits.by_pose()], axis=2)
+        return _Differences(first.points_map - second.points_map, jacobian, root)
 
-    def _by_parameter(
-        self, mount: Mount, hits: GroundHits, px: FloatArray, poses: FloatArray, image: IntArray
-    ) -> FloatArray:
-        """Derivative (N, 2) of ground points by the freed parameter."""
+    def _sides(self, now: _Unknowns, poses: FloatArray, noise_px: Sequence[FloatArray]) -> list[_Side]:
+        """Both sides of the matches with ``noise_px`` (N, 2) of each removed, to first order put back."""
+        sides = []
+        for half, off_px, lower_m in zip(_halves(self.observations), noise_px, self.lower_m, strict=True):
+            px = half.px - off_px
+            hits = hit_ground(now.mount, px, poses[half.image])
+            by_px = by_pixel(now.mount, hits)
+            terms = _terms(now.mount, px)
+            falling = hits.by_fall(lower_m)
+            moved_px = off_px + terms @ now.bends.reshape(2, _BENDS).T
+            points_map = hits.points_map + (by_px @ moved_px[:, :, None])[..., 0] + now.roof * falling
+            sides.append(_Side(half.image, px, hits, by_px, terms, falling, points_map))
+        return sides
+
+    def _by_shared(self, now: _Unknowns, poses: FloatArray, side: _Side) -> FloatArray:
+        """Jacobian (N, 2, S) of ground points by the unknowns that all images share."""
+        hits = side.hits
+        bending = side.by_px[..., None] * side.terms[:, None, None]
+        columns = [hits.by_mount(), bending.reshape(-1, 2, 2 * _BENDS), side.falling[:, :, None]]
         if self.free == "clock_s":
-            return hits.by_motion(self.prior.velocity[image])
-        if self.free == "grade":
-            return -hits.by_fall(self.prior.climb_m[image])
-        return by_lens(mount, px, poses, str(self.free))
+            columns.append(hits.by_motion(self.prior.velocity[side.image])[:, :, None])
+        elif self.free == "grade":
+            columns.append(-hits.by_fall(self.prior.climb_m[side.image])[:, :, None])
+        elif self.free is not None:
+            columns.append(by_lens(now.mount, side.px, poses[side.image], self.free)[:, :, None])
+        return np.concatenate(columns, axis=2)
 
     def _sum_pairs(
         self, rows: FloatArray, value: FloatArray, observations: Observations
@@ -399,8 +405,17 @@ def _beside_m(course_map: FloatArray, points_map: FloatArray) -> FloatArray:
     return np.concatenate(beside_m)
 
 
-def _bending(mount: Mount, px: FloatArray, by_px: FloatArray) -> FloatArray:
-    """Jacobian (N, 2, 12) of ground points by the coefficients of the smooth pixel error, px."""
+def _terms(mount: Mount, px: FloatArray) -> FloatArray:
+    """Terms (N, 6) of the smooth error of each pixel coordinate."""
     u, v = (2 * px / [mount.info.width, mount.info.height] - 1).T
-    terms = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v], axis=1)
-    return np.concatenate([by_px[:, :, k, None] * terms[:, None] for k in (0, 1)], axis=2)
+    return np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v], axis=1)
+
+
+def _whitening(sides: Sequence[_Side]) -> FloatArray:
+    """Roots (N, 2, 2) that whiten the differences of both sides' points; nan where one misses the ground."""
+    first, second = (PIXEL_SIGMA * side.by_px for side in sides)
+    spread = first @ np.swapaxes(first, 1, 2) + second @ np.swapaxes(second, 1, 2)
+    usable = np.isfinite(spread).all(axis=(1, 2))
+    root = np.full(spread.shape, np.nan)
+    root[usable] = np.linalg.inv(np.linalg.cholesky(spread[usable]))
+    return root

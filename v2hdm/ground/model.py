@@ -8,7 +8,7 @@ import numpy as np
 
 from v2hdm.geometry.ipm import initial_extrinsic, project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.geometry.rigid import hat, rotation_from_vector
+from v2hdm.geometry.rigid import rotation_from_vector
 from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray
 
 _LENS_STEP = 1e-5  # step of finite differences: of the focal length, relative, and of k1
@@ -115,11 +115,11 @@ class GroundHits:
 
     def by_mount(self) -> FloatArray:
         """Derivative (N, 2, 6) by the mount's turn (3, rad) and its centre (3, m), in vehicle axes."""
-        return np.concatenate([self.plane @ -hat(self.arm), self.plane], axis=2)
+        return np.concatenate([np.cross(self.arm[:, None], self.plane), self.plane], axis=2)
 
     def by_pose(self) -> FloatArray:
         """Derivative (N, 2, 6) by the vehicle's turn (3, rad) and shift (3, m), in vehicle axes."""
-        return np.concatenate([self.plane @ -hat(self.point_vehicle), self.plane], axis=2)
+        return np.concatenate([np.cross(self.point_vehicle[:, None], self.plane), self.plane], axis=2)
 
     def by_fall(self, lower_m: FloatArray) -> FloatArray:
         """First-order shift (N, 2) of the points for ground ``lower_m`` (N,) below the plane."""
@@ -143,11 +143,10 @@ def hit_ground(mount: Mount, points_px: FloatArray, poses: FloatArray) -> Ground
     down = np.where(rays_map[:, 2] < -1e-3, rays_map[:, 2], np.nan)
     far = -centre_map[:, 2] / down
     points_map = centre_map[:, :2] + far[:, None] * rays_map[:, :2]
-    slide = np.zeros((len(far), 2, 3))
-    slide[:, 0, 0] = slide[:, 1, 1] = 1.0
-    slide[:, :, 2] = -rays_map[:, :2] / down[:, None]
+    # Ground below the vehicle's slides along the ray.
+    plane = turn[:, :2] - (rays_map[:, :2] / down[:, None])[:, :, None] * turn[:, 2:]
     arm = far[:, None] * rays_vehicle
-    return GroundHits(points_map, slide @ turn, arm, mount.centre_vehicle + arm)
+    return GroundHits(points_map, plane, arm, mount.centre_vehicle + arm)
 
 
 def by_lens(mount: Mount, points_px: FloatArray, poses: FloatArray, name: str) -> FloatArray:
@@ -164,4 +163,4 @@ def by_pixel(mount: Mount, hits: GroundHits) -> FloatArray:
     """
     depth = np.linalg.norm(hits.arm @ mount.vehicle_from_cam_rotation[:, 2:], axis=1)
     across = mount.vehicle_from_cam_rotation @ np.linalg.inv(mount.info.intrinsic)[:, :2]
-    return np.asarray(hits.plane @ (depth[:, None, None] * across))
+    return np.asarray(depth[:, None, None] * (hits.plane.reshape(-1, 3) @ across).reshape(-1, 2, 2))
