@@ -90,9 +90,9 @@ class Cells:
     def add(self, light: FloatArray) -> None:
         """Add the light (along, across) of one image."""
         count = len(_BESIDE_M)
-        beside = np.median([light[:, :count], light[:, -count:]], axis=2)
-        padded = np.pad(beside, ((0, 0), (4, 4)), mode="edge")
-        ground = np.median(np.lib.stride_tricks.sliding_window_view(padded, 9, axis=1), axis=2)
+        beside = _median_along(np.stack([light[:, :count], light[:, -count:]]))
+        around = np.arange(len(light))[:, None] + np.arange(-4, 5)
+        ground = _median_along(beside[:, np.clip(around, 0, len(light) - 1)])
         ground = np.stack([*ground, ground.mean(axis=0)])
         self.contrasts.append(light[:, count:-count] / np.maximum(ground, 1e-4)[..., None] - 1.0)
 
@@ -128,6 +128,13 @@ class Cells:
         of_images = np.median(np.mean(self.contrasts, axis=1), axis=(1, 2)) / _CONTRASTS[:, None]
         scatter = np.median(np.abs(of_images - np.median(of_images, axis=1, keepdims=True)), axis=1)
         return Fit(log_likelihood * min(1.0, _INDEPENDENT / cells.size), share, np.hypot(doubt, scatter))
+
+
+def _median_along(values: FloatArray) -> FloatArray:
+    """Medians along the last axis of finite values; numpy's own take several times as long."""
+    ordered = np.sort(values, axis=-1)
+    count = values.shape[-1]
+    return np.asarray(ordered[..., (count - 1) // 2 : count // 2 + 1].mean(axis=-1))
 
 
 def _shares_of_side(side_m: float, least: int, most: int) -> FloatArray:
@@ -238,21 +245,24 @@ def _best_views(
     if not cells:
         return {}
     tree = cKDTree([cells_of_marking.places_map.mean(axis=(0, 1)) for cells_of_marking in cells])
+    corners_map = np.array([of_marking.places_map[[0, 0, -1, -1], [0, -1, 0, -1]] for of_marking in cells])
     views: list[list[tuple[float, int]]] = [[] for _ in cells]
     for index, (image, pose) in enumerate(zip(footage.images, footage.map_from_vehicle, strict=True)):
         if image.camera not in footage.calibrations:
             continue
         info = footage.calibrations[image.camera].info
-        for number in tree.query_ball_point(pose[:2, 3], _NEAR_M):
-            if (index, number) not in shown:
-                continue
-            corners = cells[number].places_map[[0, 0, -1, -1], [0, -1, 0, -1]]
-            pinhole, depth_m = footage.pinhole_px(index, corners)
-            if (depth_m <= 0.3).any():
-                continue
-            px = distort_points(info, pinhole)
-            if (px >= 2).all() and (px <= (info.width - 3, info.height - 3)).all():
-                views[number].append((float(np.linalg.norm(corners.mean(axis=0) - pose[:2, 3])), index))
+        near = tree.query_ball_point(pose[:2, 3], _NEAR_M)
+        numbers = np.array([number for number in near if (index, number) in shown], dtype=np.intp)
+        if not len(numbers):
+            continue
+        corners = corners_map[numbers]
+        pinhole, depth_m = footage.pinhole_px(index, corners.reshape(-1, 2))
+        before = (depth_m.reshape(-1, 4) > 0.3).all(axis=1)
+        px = distort_points(info, pinhole.reshape(-1, 4, 2)[before].reshape(-1, 2)).reshape(-1, 4, 2)
+        is_seen = ((px >= 2) & (px <= (info.width - 3, info.height - 3))).all(axis=(1, 2))
+        range_m = np.linalg.norm(corners[before][is_seen].mean(axis=1) - pose[:2, 3], axis=1)
+        for number, away_m in zip(numbers[before][is_seen].tolist(), range_m.tolist(), strict=True):
+            views[number].append((away_m, index))
     markings_of_image: dict[int, list[int]] = {}
     fewest, most = _VIEWS
     for number, views_of_marking in enumerate(views):
@@ -273,10 +283,12 @@ def _lights(
     """Each wanted marking of each image, and the light of its cells (along, across) there."""
     for index, pixels in footage.read(sorted(markings_of_image), colours, threads):
         info = footage.calibrations[footage.images[index].camera].info
-        for number in markings_of_image[index]:
-            places_map = cells[number].places_map
-            px = distort_points(info, footage.pinhole_px(index, places_map.reshape(-1, 2))[0])
-            yield number, _light_at(px.reshape(places_map.shape), pixels)
+        places_map = [cells[number].places_map for number in markings_of_image[index]]
+        flat_map = np.concatenate([places.reshape(-1, 2) for places in places_map])
+        px = distort_points(info, footage.pinhole_px(index, flat_map)[0])
+        parts = np.split(px, np.cumsum([places.size // 2 for places in places_map])[:-1])
+        for number, places, part in zip(markings_of_image[index], places_map, parts, strict=True):
+            yield number, _light_at(part.reshape(places.shape), pixels)
 
 
 def _light_at(px: FloatArray, pixels: NDArray[np.uint8]) -> FloatArray:
