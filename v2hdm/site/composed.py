@@ -148,12 +148,13 @@ def _offsets(points: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatAr
     step = np.diff(other, axis=0)
     length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
     share = np.einsum("nsi,si->ns", points[:, None] - start, step) / length**2
-    foot = start + np.clip(share, 0.0, 1.0)[..., None] * step
-    distance = np.linalg.norm(points[:, None] - foot, axis=2)
-    nearest = distance.argmin(axis=1)
+    # By coordinate: numpy is slow with pairs.
+    foot = start.T[:, None] + np.clip(share, 0.0, 1.0) * step.T[:, None]
+    east, north = points.T[:, :, None] - foot
+    nearest = np.sqrt(east * east + north * north).argmin(axis=1)
     rows = np.arange(len(points))
     ahead = _directions(points)
-    off_m = ((foot[rows, nearest] - points) * turned_left(ahead)).sum(axis=1)
+    off_m = ((foot[:, rows, nearest].T - points) * turned_left(ahead)).sum(axis=1)
     cosine = np.abs((step[nearest] / length[nearest, None] * ahead).sum(axis=1))
     beyond = (nearest == 0) & (share[rows, nearest] < -_STEP_M / length[nearest])
     beyond |= (nearest == len(step) - 1) & (share[rows, nearest] > 1 + _STEP_M / length[nearest])
