@@ -165,14 +165,15 @@ def run_methods(
     grey: Callable[[Image], Pixels] | None = None,
     *,
     naive: bool = True,
+    stated: bool = True,
 ) -> dict[str, MethodResult]:
     """Map a drive, ignoring ground truth, by every method that the cameras' IPMs allow.
 
     ``progress`` receives the name of each step at its start. ``Opt`` updates the earlier map ``base``;
     ``grey`` reads the images in which it looks at bare places and at ends: grey values (H, W) or colours
-    (H, W, 3). Results are by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``,
-    ``ONI``; without ``naive`` ``Opt`` alone. Raises MappingError if there is nothing to map, ConfigError for
-    an option out of range.
+    (H, W, 3). Results are by method: those of :func:`map_as_stated`, ``Opt``, ``ONI``; without ``naive``
+    ``Opt`` alone, without ``stated`` the last two. Raises MappingError if there is nothing to map,
+    ConfigError for an option out of range.
     """
     options = options or MappingOptions()
     check_options(options)
@@ -183,7 +184,7 @@ def run_methods(
 
     progress("linking sightings")
     inputs = Inputs(drive, detections, cameras, options, grey)
-    results = run_stated(inputs, progress) if naive else {}
+    results = run_stated(inputs, progress) if naive and stated else {}
     outcome, optimised = optimise(inputs, progress)
     optimal = optimised_result(outcome, optimised)
     if base is not None:
@@ -194,6 +195,19 @@ def run_methods(
         progress("ONI")
         results["ONI"] = run_optimised(outcome.inputs, optimal.calibrations)
     return results
+
+
+def map_as_stated(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    cameras: Sequence[str],
+    options: MappingOptions,
+    progress: Callable[[str], None] = silent,
+) -> dict[str, MethodResult]:
+    """Naive maps under the IPMs that were stated: ``CNI`` and ``ENI``, where every camera has such an IPM."""
+    from v2hdm.mapping.naive import run_stated  # only a comparison needs it
+
+    return run_stated(Inputs(drive, detections, cameras, options), progress)
 
 
 def _unused_points(survey: SurveyOptions, bundle: Bundle) -> list[str]:

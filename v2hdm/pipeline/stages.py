@@ -1,7 +1,7 @@
 """The stages of detection and mapping, kept part by part: a run that was stopped goes on in the middle.
 
 A piece of detection rests on the pixels of its images and on what is known of their cameras, not on where or
-of which drive they are. Mapping is kept by sets of cameras, each with every method.
+of which drive they are. Mapping is kept by sets of cameras, what needs an adjustment apart from the rest.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import WorkerError
+from v2hdm.executor import Executor
 from v2hdm.io.detections import detections_of, read_detections
-from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.methods import map_as_stated, run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
 from v2hdm.pipeline.config import Contents, model_key
@@ -161,46 +162,50 @@ def map_camera_sets(
     if not compare:
         sets = dict([list(sets.items())[-1]])
     common_key = cache.key(drive_key, list(detections), survey.mapping, compare, section_m)
-    *single, last = sets
-    keys = {name: cache.key(common_key, name, sets[name], None) for name in single}
-    keys[last] = cache.key(common_key, last, sets[last], (base, survey.check))
-    cached = {name: cache.get(_MAP, key, MappedSet) for name, key in keys.items()}
-    mapped_sets = {name: mapped for name, mapped in cached.items() if mapped is not None}
-    context.progress("map", len(mapped_sets), len(sets))
+    last = list(sets)[-1]
+    # The longest first, so that processes end together.
+    jobs = [_Job(name, sets[name]) for name in sorted(sets, key=lambda name: -len(sets[name]))]
+    if compare:
+        jobs += [job._replace(stated=True) for job in jobs if not (section_m and job.name == last)]
+    keys = {
+        job: cache.key(common_key, *job, None if job.stated or job.name != last else (base, survey.check))
+        for job in jobs
+    }
+    cached = {job: cache.get(_MAP, key, MappedSet) for job, key in keys.items()}
+    mapped_by_job = {job: mapped for job, mapped in cached.items() if mapped is not None}
+
+    def report() -> None:
+        waiting = {job.name for job in jobs if job not in mapped_by_job}
+        context.progress("map", len(sets) - len(waiting), len(sets))
 
     def take(outcome: _Outcome) -> None:
-        name = outcome.name
-        mapped_sets[name] = cache.put(_MAP, keys[name], MappedSet, outcome.mapped, outcome.lines)
-        context.progress("map", len(mapped_sets), len(sets))
+        job = outcome.job
+        mapped_by_job[job] = cache.put(_MAP, keys[job], MappedSet, outcome.mapped, outcome.lines)
+        report()
 
-    if section_m and last not in mapped_sets:
-        take(_in_sections(drive, detections, survey, last, sets[last], section_m, context))
+    report()
+    whole = _Job(last, sets[last])
+    if section_m and whole not in mapped_by_job:
+        take(_in_sections(drive, detections, survey, whole, section_m, context))
     work = _Work(drive, detections, survey, base, last, compare)
-    # The largest first, so that processes end together.
-    todo = [
-        _Job(name, sets[name])
-        for name in sorted(sets, key=lambda name: -len(sets[name]))
-        if name not in mapped_sets
-    ]
-    is_large = sum(len(in_image.markings) for in_image in detections) > _WORTH_PROCESSES
-    if len(todo) > 1 and context.executor.workers > 1 and survey.mapping.device == "cpu" and is_large:
-        for _, outcome in context.executor.side_by_side(work, todo):
-            if isinstance(outcome, WorkerError):
-                raise outcome
-            log_again(outcome.lines)
-            take(outcome)
-    else:
-        for job in todo:
-            take(work(job))
-    return {name: mapped_sets[name] for name in sets}
+    _do(work, [job for job in jobs if job not in mapped_by_job], context.executor, take)
+    return {
+        name: _together([mapped_by_job[job] for job in reversed(jobs) if job.name == name]) for name in sets
+    }
+
+
+def _together(parts: Sequence[MappedSet]) -> MappedSet:
+    """The methods of one set of cameras from several jobs, the last of which was the adjustment's."""
+    return MappedSet(
+        {name: result for part in parts for name, result in part.methods.items()}, parts[-1].checked
+    )
 
 
 def _in_sections(
     drive: Drive,
     detections: Sequence[ImageDetections],
     survey: Survey,
-    name: str,
-    cameras: Sequence[str],
+    job: _Job,
     section_m: float,
     context: Context,
 ) -> _Outcome:
@@ -216,7 +221,7 @@ def _in_sections(
         best = map_in_sections(
             drive,
             source,
-            cameras,
+            job.cameras,
             survey.mapping,
             section_m,
             context.executor,
@@ -226,9 +231,9 @@ def _in_sections(
         )
         _log.info(
             "mapped with %s in sections: %d markings, %.1f s",
-            name, len(best.hd_map.markings), time.perf_counter() - begin_s,
+            job.name, len(best.hd_map.markings), time.perf_counter() - begin_s,
         )  # fmt: skip
-    return _Outcome(name, MappedSet({BEST: best}), lines)
+    return _Outcome(job, MappedSet({BEST: best}), lines)
 
 
 @dataclass(frozen=True)
@@ -250,21 +255,39 @@ class _Detections:
 
 
 class _Job(NamedTuple):
-    """A set of cameras to map."""
+    """A set of cameras to map: by the IPMs that were ``stated``, or all else, which takes ten times as long.
+
+    Apart, the short ones keep a process busy that has finished its long ones.
+    """
 
     name: str
-    cameras: Sequence[str]
+    cameras: tuple[str, ...]
+    stated: bool = False
 
 
 class _Outcome(NamedTuple):
     """A set of cameras that was mapped, and what was logged."""
 
-    name: str
+    job: _Job
     mapped: MappedSet
     lines: list[Line]
 
 
 _WORTH_PROCESSES = 4000  # detected markings whose mapping takes as long as processes take to start
+
+
+def _do(work: _Work, jobs: Sequence[_Job], executor: Executor, take: Callable[[_Outcome], None]) -> None:
+    """Map sets of cameras, side by side where that is worth the start of processes."""
+    is_large = sum(len(in_image.markings) for in_image in work.detections) > _WORTH_PROCESSES
+    if len(jobs) > 1 and executor.workers > 1 and work.survey.mapping.device == "cpu" and is_large:
+        for _, outcome in executor.side_by_side(work, jobs):
+            if isinstance(outcome, WorkerError):
+                raise outcome
+            log_again(outcome.lines)
+            take(outcome)
+    else:
+        for job in jobs:
+            take(work(job))
 
 
 @dataclass(frozen=True)
@@ -284,19 +307,23 @@ class _Work:
     def __call__(self, job: _Job, _: Progress = silent) -> _Outcome:
         """Map one set of cameras."""
         with recorded() as lines:
-            mapped = self._map(job.name, job.cameras)
-        return _Outcome(job.name, mapped, lines)
+            mapped = self._map(job)
+        return _Outcome(job, mapped, lines)
 
-    def _map(self, name: str, cameras: Sequence[str]) -> MappedSet:
+    def _map(self, job: _Job) -> MappedSet:
         begin_s = time.perf_counter()
         drive = self.drive
         survey = self.survey
+        name = job.name
         log = partial(_log.debug, "%s: %s", name)
+        if job.stated:
+            return MappedSet(map_as_stated(drive, self.detections, job.cameras, survey.mapping, log))
         base = self.base if name == self.last else None
         grey = grey_reader(drive)
         methods = run_methods(
-            drive, self.detections, cameras, survey.mapping, log, base, grey, naive=self.compare
-        )
+            drive, self.detections, job.cameras, survey.mapping, log, base, grey,
+            naive=self.compare, stated=False,
+        )  # fmt: skip
         best = methods[BEST]
         checked = compare_survey(survey, drive, best) if name == self.last else None
         # The factors of the adjustment are large; whoever needs more of them asks while they are here.
