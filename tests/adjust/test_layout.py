@@ -15,7 +15,8 @@ import torch
 
 from tests.adjust.scene import make_scene
 from v2hdm import native
-from v2hdm.adjust import KnownLengths, PoseSigma, SolveOptions, arrays, solve
+from v2hdm.adjust import KnownLengths, PoseSigma, SolveOptions, arrays, covariance, solve
+from v2hdm.adjust.covariance import Moves
 from v2hdm.adjust.descent import minimise
 from v2hdm.adjust.kernels.layout import Seen, arrange, find_touched, first_not_rigid, lay_out
 from v2hdm.adjust.problem import LINE_EXCESS, POSE_STATES
@@ -61,6 +62,20 @@ def test_the_covariance_of_corners_that_lengths_join_knows_the_lengths_however_t
         along = np.zeros(8)
         along[2 * k : 2 * k + 4] = np.concatenate([direction, -direction])
         assert np.sqrt(along @ joint @ along) < sigma_m
+
+
+def test_columns_are_solved_for_once_and_as_many_are_kept_as_memory_allows(monkeypatch):
+    solution = solve(street(), SolveOptions(pose_states=POSE_STATES))
+    groups = np.array([[0, 40], [9, 12]])
+    alone = solution.corner_covariance(groups)
+    for most in (2000, 0):
+        monkeypatch.setattr(covariance, "_NUMBERS_KEPT", most)
+        again = dataclasses.replace(solution.covariance, roots=type(solution.covariance.roots)())
+        np.testing.assert_array_equal([again.corners(groups), again.corners(groups)], [alone, alone])
+    common = Moves(np.ones((len(solution.corners_map), 2, 1)), np.zeros((2, 6, 1)), np.zeros((40, 6, 1)))
+    monkeypatch.setattr(covariance, "reduced_root", None)
+    uncertain = dataclasses.replace(solution.covariance, held=common)
+    np.testing.assert_allclose(uncertain.corners(groups), alone + 1.0)
 
 
 @pytest.mark.parametrize("compiled", [True, False])

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -42,21 +41,38 @@ class Moves:
         )
 
 
-@dataclass(frozen=True)
 class _Roots:
-    """The columns of :func:`reduced_root` that were solved for so far: each is asked for several times."""
+    """The columns of :func:`reduced_root` that were solved for so far: each is asked for several times.
 
-    by_corner: Tensor  # (N, 2, D)
-    is_solved: Tensor  # (N,)
+    As many are kept as memory allows, each from its first number on that is not zero: often the second half.
+    """
+
+    def __init__(self) -> None:
+        self._by_corner: dict[int, Tensor] = {}  # (2, D - first) each
+        self._numbers = 0
 
     def of(self, whitening: Whitening, corners: Tensor) -> Tensor:
         """The rows (2 n, D) of n corners, ascending."""
-        missing = corners[~self.is_solved[corners]]
-        if len(missing):
-            root = reduced_root(whitening, missing)
-            self.by_corner[missing] = root.mT.reshape(len(missing), 2, -1)
-            self.is_solved[missing] = True
-        return self.by_corner[corners].flatten(0, 1)
+        numbers = corners.tolist()
+        is_missing = torch.tensor([number not in self._by_corner for number in numbers])
+        rows = whitening.reduced_factor.tip.new_zeros(len(corners), 2, whitening.reduced_factor.size)
+        if is_missing.any():
+            solved = reduced_root(whitening, corners[is_missing]).mT.reshape(-1, *rows.shape[1:])
+            rows[is_missing] = solved
+            self._keep(corners[is_missing].tolist(), solved)
+        for row, number in zip(rows, numbers, strict=True):
+            kept = self._by_corner.get(number)
+            if kept is not None:
+                row[:, row.shape[1] - kept.shape[1] :] = kept
+        return rows.flatten(0, 1)
+
+    def _keep(self, numbers: list[int], rows: Tensor) -> None:
+        first = (rows != 0).any(dim=1).to(torch.uint8).argmax(dim=1).tolist()
+        for number, begin, row in zip(numbers, first, rows, strict=True):
+            size = row[:, begin:].numel()
+            if self._numbers + size <= _NUMBERS_KEPT:
+                self._by_corner[number] = row[:, begin:].clone()
+                self._numbers += size
 
 
 @dataclass(frozen=True)
@@ -69,6 +85,7 @@ class Covariance:
 
     descent: Descent
     held: Moves | None = None  # the part of quantities held fixed, but uncertain
+    roots: _Roots = field(default_factory=_Roots, repr=False)  # whatever is held fixed
 
     @property
     def whitening(self) -> Whitening:
@@ -156,22 +173,6 @@ class Covariance:
         if part:
             yield np.array(part)
 
-    @cached_property
-    def _roots(self) -> _Roots | None:
-        """The solved right-hand sides that are kept; None where they would take too much memory."""
-        size = self.whitening.reduced_factor.size
-        count = self.whitening.engine.arrays.corner_count
-        if 2 * count * size > _NUMBERS_KEPT:
-            return None
-        tip = self.whitening.reduced_factor.tip
-        return _Roots(tip.new_empty(count, 2, size), tip.new_zeros(count, dtype=torch.bool))
-
-    def _root(self, corners: Tensor) -> Tensor:
-        """The transpose (2 n, D) of :func:`reduced_root` of n corners, ascending."""
-        if self._roots is None:
-            return reduced_root(self.whitening, corners).mT
-        return self._roots.of(self.whitening, corners)
-
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
         arrays = self.whitening.engine.arrays
         rank = torch.argsort(arrays.corner_order)
@@ -179,7 +180,7 @@ class Covariance:
         # Known lengths couple V^-1 of corners to others outside their group.
         joined = _with_joined(arrays, chosen)
         corners = torch.unique(joined)
-        root = self._root(corners)
+        root = self.roots.of(self.whitening, corners)
         # Of what is eliminated before the corners' frames the columns are zero: often half of them.
         by_near = root[:, root.any(dim=0)][_columns(corners, joined)]
         # V^-1 of the corners and all joined ones; 1 for kept corners.

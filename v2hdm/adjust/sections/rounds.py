@@ -275,7 +275,7 @@ class Work:
         if job.is_finish:
             held = replace(descent, engine=opened.engine, last_whitening=whitening)
             joint = np.load(covariance_file(self.folder, job.number))
-            solution = replace(solution, covariance=JoinedCovariance(held, None, opened.border, joint))
+            solution = replace(solution, covariance=JoinedCovariance(held, border=opened.border, joint=joint))
         return self.finish(job.number, part, solution)
 
 
