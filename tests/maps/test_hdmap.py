@@ -278,7 +278,17 @@ def test_a_corner_behind_the_camera_has_no_finite_residual_and_is_read_back(dist
     np.testing.assert_array_equal(read.distance_sigma, written.distance_sigma)
 
 
-@pytest.mark.parametrize("line", ["front/x.png,front,1.0,2,1", "front/x.png,front,late,2,1,1,0,0,0,0,0"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "front/x.png,front,1.0,2,1",
+        "front/x.png,front,late,2,1,1,0,0,0,0,0",
+        "front/x.png,front,1.0,2.5,1,1,0,0,0,0,0",
+        "front/x.png,front,1.0,2,5,1,0,0,0,0,0",
+        "front/x.png,front,1.0,2,1,1,0,1e13,0,0,0",
+        "front/x.png,front,1e13,2,1,1,0,0,0,0,0",
+    ],
+)
 def test_a_damaged_line_is_named(line, tmp_path):
     path = tmp_path / "residuals.csv"
     write_residuals(some_residuals(), path)

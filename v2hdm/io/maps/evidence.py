@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -70,16 +69,23 @@ class Residuals:
 
 def write_residuals(residuals: Residuals, path: Path) -> None:
     """Write ``residuals`` to ``path``, atomically, one row for each observation."""
-    rows: list[Sequence[object]] = [COLUMNS]
-    for k, i in enumerate(residuals.row_image.tolist()):
-        u, v = residuals.observed_px[k]
-        du, dv = residuals.residual_px[k]
-        rows.append([
-            residuals.image[i], residuals.camera[i], f"{residuals.taken_s[i]:.6f}",
-            residuals.marking[k] or "", residuals.corner[k] + 1, int(residuals.is_point[k]),
-            f"{u:.3f}", f"{v:.3f}", f"{du:.4f}", f"{dv:.4f}", f"{residuals.distance_sigma[k]:.3f}",
-        ])  # fmt: skip
-    files.replace_csv(path, rows)
+    described = zip(residuals.image, residuals.camera, residuals.taken_s.tolist(), strict=True)
+    # All that may need quotes is told once an image.
+    begins = [
+        files.csv_text([(image, camera, f"{taken_s:.6f}")]).removesuffix("\n")
+        for image, camera, taken_s in described
+    ]
+    columns = (
+        residuals.row_image, residuals.marking, residuals.corner, residuals.is_point,
+        *residuals.observed_px.T, *residuals.residual_px.T, residuals.distance_sigma,
+    )  # fmt: skip
+    lines = [
+        f"{begins[i]},{marking or ''},{corner + 1},{point:d},{u:.3f},{v:.3f},{du:.4f},{dv:.4f},{sigma:.3f}"
+        for i, marking, corner, point, u, v, du, dv, sigma in zip(
+            *(column.tolist() for column in columns), strict=True
+        )
+    ]
+    files.replace_text(path, "\n".join([",".join(COLUMNS), *lines, ""]))
 
 
 def read_residuals(path: Path) -> Residuals:
@@ -90,20 +96,23 @@ def read_residuals(path: Path) -> Residuals:
     images: dict[str, tuple[int, str, float]] = {}
     row_image = []
     numbers = []
+    problem = f"not {len(COLUMNS)} fields as in the header, with possible numbers; map the drive again"
     for line, row in enumerate(rows[1:], start=2):
         try:
             image, camera, taken_s, marking, *figures = row
             number, _, _ = images.setdefault(image, (len(images), camera, float(taken_s)))
-            numbers.append([float(marking or 0), *(float(figure) for figure in figures)])
-            if len(numbers[-1]) != len(COLUMNS) - 3 or not _is_sound(numbers[-1], images[image][2]):
+            numbers.append([float(marking or 0), *map(float, figures)])
+            if len(row) != len(COLUMNS):
                 raise ValueError
         except ValueError:
-            problem = f"not {len(COLUMNS)} fields as in the header, with possible numbers"
-            raise MapFileError(f"{path}: line {line}: {problem}; map the drive again") from None
+            raise MapFileError(f"{path}: line {line}: {problem}") from None
         row_image.append(number)
     table = np.array(numbers, dtype=np.float64).reshape(-1, len(COLUMNS) - 3)
     cameras = tuple(camera for _, camera, _ in images.values())
     stamps = np.array([stamp for _, _, stamp in images.values()])
+    is_sound = _are_sound(table, stamps[row_image])
+    if not is_sound.all():
+        raise MapFileError(f"{path}: line {int(np.argmin(is_sound)) + 2}: {problem}")
     ids, corners = table[:, :2].astype(np.int64).T
     return Residuals(
         image=tuple(images),
@@ -119,13 +128,15 @@ def read_residuals(path: Path) -> Residuals:
     )
 
 
-def _is_sound(numbers: Sequence[float], taken_s: float) -> bool:
-    """Whether the numbers of a line, from ``marking`` on, and the time of its image can be."""
-    marking, corner = numbers[:2]
-    is_whole = 0 <= marking <= _LARGEST_ID and marking.is_integer() and corner in (1, 2, 3, 4)
+def _are_sound(table: FloatArray, taken_s: FloatArray) -> BoolArray:
+    """Whether the numbers (K, 8) of lines, from ``marking`` on, and the times of their images can be."""
+    marking, corner = table[:, :2].T
+    is_whole = (marking >= 0) & (marking <= _LARGEST_ID) & (marking == np.floor(marking))
+    is_place = (np.abs(table[:, 2:5]) <= _LARGEST).all(axis=1) & (np.abs(taken_s) <= _LARGEST)
     # A corner behind the camera has a place in the image, and no finite residual.
-    is_residual = all(abs(number) <= _LARGEST or not math.isfinite(number) for number in numbers[5:])
-    return is_whole and is_residual and all(abs(number) <= _LARGEST for number in (*numbers[2:5], taken_s))
+    off = table[:, 5:]
+    is_residual = ((np.abs(off) <= _LARGEST) | ~np.isfinite(off)).all(axis=1)
+    return np.asarray(is_whole & np.isin(corner, (1, 2, 3, 4)) & is_place & is_residual)
 
 
 def write_exclusions(
