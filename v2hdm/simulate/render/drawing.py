@@ -20,52 +20,6 @@ _f = np.float32
 _u = np.uint8
 
 
-@exactly_inlined
-def _bands_of_one(boundary: Any, bounds: Any, limits: Any, number: Any, out: Any) -> Any:
-    """Write the windows of an outline from ``number`` on; returns the number of the next one's first."""
-    first_row, height, width = bounds
-    count = len(boundary)
-    top = boundary[0, 1]
-    bottom = boundary[0, 1]
-    left = boundary[0, 0]
-    right = boundary[0, 0]
-    for k in range(count):
-        top = min(top, boundary[k, 1])
-        bottom = max(bottom, boundary[k, 1])
-        left = min(left, boundary[k, 0])
-        right = max(right, boundary[k, 0])
-    begin = max(int(np.floor(top)) - 2, first_row)
-    end = min(int(np.ceil(bottom)) + 3, height)
-    step = limits[0] if (end - begin) * (right - left) > limits[1] else max(end - begin, 1)
-    for row in range(begin, end, step):
-        last = min(row + step, end)
-        least = np.inf
-        most = -np.inf
-        for k in range(count):
-            following = k + 1 if k + 1 < count else 0
-            rise = boundary[following, 1] - boundary[k, 1]
-            if rise == 0:
-                rise = 1e-9
-            for level in (row - 2.0, last + 2.0):
-                at = min(max((level - boundary[k, 1]) / rise, 0.0), 1.0)
-                y = boundary[k, 1] + at * (boundary[following, 1] - boundary[k, 1])
-                if row - 2.01 <= y <= last + 2.01:
-                    x = boundary[k, 0] + at * (boundary[following, 0] - boundary[k, 0])
-                    least = min(least, x)
-                    most = max(most, x)
-        if least > most:
-            continue
-        first_column = max(int(np.floor(least)) - 2, 0)
-        end_column = min(int(np.ceil(most)) + 3, width)
-        if first_column < end_column:
-            out[number, 0] = row
-            out[number, 1] = last
-            out[number, 2] = first_column
-            out[number, 3] = end_column
-            number += 1
-    return number
-
-
 @exact_kernel
 def bands(
     boundaries_px: FloatArray,
@@ -79,10 +33,49 @@ def bands(
 
     ``bounds`` are the first row, height and width of what is drawn, ``limits`` a window's rows and that area.
     """
-    number = 0
+    first_row, height, width = bounds
     for p in range(len(rows) - 1):
+        number = rows[p]
         boundary = boundaries_px[boundary_rows[p] : boundary_rows[p + 1]]
-        number = _bands_of_one(boundary, bounds, limits, number, out)
+        count = len(boundary)
+        top = np.inf
+        bottom = -np.inf
+        left = np.inf
+        right = -np.inf
+        for k in range(count):
+            top = min(top, boundary[k, 1])
+            bottom = max(bottom, boundary[k, 1])
+            left = min(left, boundary[k, 0])
+            right = max(right, boundary[k, 0])
+        begin = max(int(np.floor(top)) - 2, first_row)
+        end = min(int(np.ceil(bottom)) + 3, height)
+        step = limits[0] if (end - begin) * (right - left) > limits[1] else max(end - begin, 1)
+        for row in range(begin, end, step):
+            last = min(row + step, end)
+            least = np.inf
+            most = -np.inf
+            for k in range(count):
+                following = k + 1 if k + 1 < count else 0
+                rise = boundary[following, 1] - boundary[k, 1]
+                if rise == 0:
+                    rise = 1e-9
+                for level in (row - 2.0, last + 2.0):
+                    at = min(max((level - boundary[k, 1]) / rise, 0.0), 1.0)
+                    y = boundary[k, 1] + at * (boundary[following, 1] - boundary[k, 1])
+                    if row - 2.01 <= y <= last + 2.01:
+                        x = boundary[k, 0] + at * (boundary[following, 0] - boundary[k, 0])
+                        least = min(least, x)
+                        most = max(most, x)
+            if least > most:
+                continue
+            first_column = max(int(np.floor(least)) - 2, 0)
+            end_column = min(int(np.ceil(most)) + 3, width)
+            if first_column < end_column:
+                out[number, 0] = row
+                out[number, 1] = last
+                out[number, 2] = first_column
+                out[number, 3] = end_column
+                number += 1
         rows[p + 1] = number
 
 
@@ -125,9 +118,13 @@ def _cover(edges: Any, parts: Any, rays: Any, row: Any, columns: Any, out: Any, 
 
 
 @exactly_inlined
-def _scale(scales: Any, p: Any, number: Any) -> Any:
-    """The scale of one of a polygon's textures, read once: LLVM would not know that it stays the same."""
-    return scales[p, number, 0], scales[p, number, 1], scales[p, number, 2], scales[p, number, 3]
+def _scales(scales: Any) -> Any:
+    """The scales of a polygon's textures, read once: LLVM would not know that they stay the same."""
+    return (
+        (scales[0, 0], scales[0, 1], scales[0, 2], scales[0, 3]),
+        (scales[1, 0], scales[1, 1], scales[1, 2], scales[1, 3]),
+        (scales[2, 0], scales[2, 1], scales[2, 2], scales[2, 3]),
+    )
 
 
 @exactly_inlined
@@ -153,9 +150,7 @@ def draw_paint(
     wear, stains, grain = tiles
     for p in range(len(looks)):
         parts = (edge_rows[p], edge_rows[p + 1])
-        wear_scale = _scale(scales, p, 0)
-        stains_scale = _scale(scales, p, 1)
-        grain_scale = _scale(scales, p, 2)
+        wear_scale, stains_scale, grain_scale = _scales(scales[p])
         threshold = looks[p, 0]
         dirty = looks[p, 1]
         blue = looks[p, 2]
