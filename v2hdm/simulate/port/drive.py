@@ -77,12 +77,13 @@ def placed_boxes(boxes: Sequence[Box]) -> FloatArray:
 
 def _may_hide(boxes: FloatArray, cam_from_map: FloatArray) -> BoolArray:
     """Flags (B,) of boxes before the camera, near enough, and not above all its sight lines to the ground."""
+    x_m, y_m, _, _, length_m, width_m, _, base_m, beneath_m, slope_x, slope_y = boxes.T
     centre = camera_centre(cam_from_map)
-    reach = np.hypot(boxes[:, 4], boxes[:, 5]) / 2
-    depth = boxes[:, [0, 1, 8]] @ cam_from_map[2, :3] + cam_from_map[2, 3]
-    height_m = boxes[:, 8] + ((centre[:2] - boxes[:, :2]) * boxes[:, 9:]).sum(axis=1)
-    is_below = boxes[:, 7] < centre[2] - height_m
-    return np.asarray(is_below & (-reach < depth) & (depth < _FARTHEST_M + reach))
+    reach_m = np.hypot(length_m, width_m) / 2
+    depth_m = np.column_stack([x_m, y_m, beneath_m]) @ cam_from_map[2, :3] + cam_from_map[2, 3]
+    ground_m = beneath_m + (centre[0] - x_m) * slope_x + (centre[1] - y_m) * slope_y
+    is_below = base_m < centre[2] - ground_m
+    return np.asarray(is_below & (-reach_m < depth_m) & (depth_m < _FARTHEST_M + reach_m))
 
 
 def _on_ground(points_map: FloatArray, relief: Relief | None) -> FloatArray:
