@@ -106,8 +106,9 @@ def locate(sightings: Sightings, rig: Rig) -> Located:
 
 def _least_variance(covariance: FloatArray) -> FloatArray:
     """Smaller eigenvalues (...) of covariances (..., 2, 2)."""
-    x, y = covariance[..., 0, 0], covariance[..., 1, 1]
-    return np.asarray((x + y) / 2 - np.hypot((x - y) / 2, covariance[..., 0, 1]))
+    of_x = covariance[..., 0, 0]
+    of_y = covariance[..., 1, 1]
+    return np.asarray((of_x + of_y) / 2 - np.hypot((of_x - of_y) / 2, covariance[..., 0, 1]))
 
 
 def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:

@@ -66,7 +66,8 @@ def plan_sheets(
         # Each tile once, as many images show it.
         number, place = np.unique(tiles @ [1, limit[0]], return_inverse=True)
         is_meant = area.meets(canvas, np.column_stack([number % limit[0], number // limit[0]]))[place]
-        tiles, shot_of = tiles[is_meant], shot_of[is_meant]
+        tiles = tiles[is_meant]
+        shot_of = shot_of[is_meant]
     in_sheet = side_px // TILE_PX
     sheet = tiles // in_sheet
     order = np.lexsort([shot_of, sheet[:, 1], sheet[:, 0]])

@@ -217,7 +217,7 @@ class _Distances(NamedTuple):
 
 
 def _factors(unknowns: FloatArray) -> FloatArray:
-    """What to multiply the terms of distances with, (G, U (U + 1) / 2 + U), at ``unknowns`` (G, U)."""
+    """Factors (G, U (U + 1) / 2 + U) of the terms of distances at ``unknowns`` (G, U)."""
     row, column = np.triu_indices(unknowns.shape[1])
     return np.hstack([np.where(row == column, 1, 2) * unknowns[:, row] * unknowns[:, column], -2 * unknowns])
 

@@ -25,7 +25,7 @@ from v2hdm.simulate.render.pixels import (
     sampled,
     write,
 )
-from v2hdm.simulate.render.scene import smooth_step
+from v2hdm.simulate.render.scene import cubic_step
 
 _f = np.float32
 _i = np.int32
@@ -198,7 +198,7 @@ def light_ground(
     for row in range(albedo.shape[0]):
         for column in range(sun.shape[1]):
             share = clip((read(wet, row, column) - low) * per_range, ZERO, ONE) if is_wet else ZERO
-            film = smooth_step(share)
+            film = cubic_step(share)
             x = read(x_m, row, column) - centre[0]
             y = read(y_m, row, column) - centre[1]
             sine = centre[2] / _f(np.sqrt(x * x + y * y + squared_height))

@@ -208,8 +208,10 @@ def _groups(places: IntArray) -> Iterator[tuple[int, int]]:
     """The first and end of faces that are drawn together, by where each one's pixels begin (F + 1,)."""
     first = 0
     while first < len(places) - 1:
-        end = int(np.searchsorted(places, places[first] + _TOGETHER_PX, side="right")) - 1
-        yield first, (first := max(end, first + 1))
+        within = int(np.searchsorted(places, places[first] + _TOGETHER_PX, side="right")) - 1
+        end = max(within, first + 1)
+        yield first, end
+        first = end
 
 
 def _planes_of(faces: Sequence[_Face], view: View) -> Float32:

@@ -85,11 +85,11 @@ def scale_of(tile: Tile, shift_m: tuple[float, float], finest_px: float = 4.0) -
 
 def smoothstep(values: Float32, low: float, high: float) -> Float32:
     """Cubic step from 0 at ``low`` to 1 at ``high``."""
-    return np.asarray(smooth_step(np.clip((values - np.float32(low)) * np.float32(1.0 / (high - low)), 0, 1)))
+    return np.asarray(cubic_step(np.clip((values - np.float32(low)) * np.float32(1.0 / (high - low)), 0, 1)))
 
 
 @exactly_inlined
-def smooth_step(share: Any) -> Any:
+def cubic_step(share: Any) -> Any:
     """Cubic step from 0 to 1 by shares from 0 to 1, of numpy or of kernels."""
     return share * share * (np.float32(3.0) - np.float32(2.0) * share)
 

@@ -177,9 +177,8 @@ def _boundaries(view: View, parts: Sequence[FloatArray]) -> tuple[FloatArray, In
     corners = np.concatenate(parts)
     corners_px = corners[:, :2] / corners[:, 2:]
     extents_px = np.maximum.reduceat(corners_px, first) - np.minimum.reduceat(corners_px, first)
-    more = np.minimum(extents_px.max(axis=1) / 40.0, 8.0).astype(
-        np.int64
-    )  # points of a side beyond its first
+    # Points of a side beyond its first.
+    more = np.minimum(extents_px.max(axis=1) / 40.0, 8.0).astype(np.int64)
     following = np.arange(1, len(corners) + 1)
     following[ends - 1] = first
     points = np.repeat(more, size) + 1  # of each side
