@@ -1,6 +1,5 @@
 """The kernels of the renderer against numpy, on planes whose sides are no multiple of a processor's step."""
 
-import cv2
 import numpy as np
 import pytest
 from numba.core.errors import TypingError
@@ -33,20 +32,6 @@ def test_the_tone_of_the_ground_is_the_faded_sum_of_its_textures(planes):
         expected += sample(tile, x, y, (3.0, 5.0)) * fade * amplitude
     assert np.allclose(tone, np.clip(expected, 0.25, 2.5), atol=1e-5)
     assert tone.std() > 0.05
-
-
-def test_marks_on_the_ground_are_interpolated_as_opencv_does_and_end_at_their_raster(planes):
-    x, y, footprint, tone = planes
-    marks = np.random.default_rng(4).integers(40, 129, (150, 90)).astype(np.uint8)
-    placed = tuple(np.float32(value) for value in (-40.0, -60.0, 0.75))
-    columns, rows = ((at - start) * placed[2] for at, start in zip((x, y), placed, strict=False))
-    factor = cv2.remap(marks, columns, rows, cv2.INTER_LINEAR, borderValue=128)
-    expected = tone * (factor.astype(np.float32) / 128)
-    assert 0.2 < (factor == 128).mean() < 0.9
-    kernels.mark_ground(marks, placed, (x, y, footprint), tone)
-
-    assert np.abs(tone / expected - 1).max() < 0.02  # OpenCV's earlier versions round its places
-    assert np.median(np.abs(tone / expected - 1)) == 0
 
 
 def test_the_sky_fades_upwards_and_ends_at_the_skyline(planes):

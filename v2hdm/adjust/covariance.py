@@ -61,9 +61,9 @@ class _Roots:
             rows[is_missing] = solved
             self._keep(corners[is_missing].tolist(), solved)
         for row, number in zip(rows, numbers, strict=True):
-            kept = self._by_corner.get(number)
-            if kept is not None:
-                row[:, row.shape[1] - kept.shape[1] :] = kept
+            columns = self._by_corner.get(number)
+            if columns is not None:
+                row[:, row.shape[1] - columns.shape[1] :] = columns
         return rows.flatten(0, 1)
 
     def _keep(self, numbers: list[int], rows: Tensor) -> None:

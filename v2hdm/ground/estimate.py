@@ -152,17 +152,17 @@ def _found(nothing: GroundEstimate, solved: _Solved, free: tuple[str, ...]) -> G
     by_axes = -np.kron([[0, 1], [1, 0]], mount.vehicle_from_cam_rotation.T)
     covariance = by_axes @ (factor * adjusted.covariance[:6, :6] + flatness) @ by_axes.T
     calibration = Calibration(mount.info, mount.cam_from_vehicle, covariance)
-    # With clock and noise of the pixels held, as where a parameter is freed: that is a few steps from there.
+    # Clock and noise of the pixels are held, as where a parameter is freed, which is a few steps from here.
     observed = solved.stated.prior_of(observations)
-    held = adjust(observed.observations, observed.prior, mount, without=adjusted)
+    start = adjust(observed.observations, observed.prior, mount, without=adjusted)
     freed = {
-        name: _free(name, observations, solved.stated, held)
+        name: _free(name, observations, solved.stated, start)
         for name in free
         if name != "clock_s" or solved.clock is None
     }
-    k1 = freed.get("distortion_k1") or _free("distortion_k1", observations, solved.stated, held)
+    k1 = freed.get("distortion_k1") or _free("distortion_k1", observations, solved.stated, start)
     # Here the camera's height is no better known than before.
-    focal = adjust(observed.observations, observed.prior, held.mount, "focal_scale", without=held)
+    focal = adjust(observed.observations, observed.prior, start.mount, "focal_scale", without=start)
     by_lens = np.array([_by_lens(focal), _by_lens(k1.adjusted)])
     return replace(
         nothing,
@@ -285,18 +285,18 @@ class _Freed(NamedTuple):
         return float(np.sqrt(self.variance + max(multiple - 1, 0.0) * data))
 
 
-def _free(name: str, observations: Observations, stated: Stated, held: Adjusted) -> _Freed:
-    """The solution with one parameter free, from that with all ``held``."""
+def _free(name: str, observations: Observations, stated: Stated, start: Adjusted) -> _Freed:
+    """The solution with one parameter free, from the ``start``, where all are held."""
     if name in _FREE_CENTRE:
         axis, sigma_m = _FREE_CENTRE[name]
         wider = replace(stated, centre_sigma_m={**stated.centre_sigma_m, axis: sigma_m})
         observed = wider.prior_of(observations)
-        adjusted = adjust(observed.observations, observed.prior, held.mount, without=held)
+        adjusted = adjust(observed.observations, observed.prior, start.mount, without=start)
         value = adjusted.mount.centre_vehicle[axis] - observed.prior.centre_vehicle[axis]
         return _Freed(float(value), adjusted, CENTRE.start + axis)
     surer = stated.with_surveyed_height() if name == "focal_scale" else stated
     observed = surer.prior_of(observations)
-    adjusted = adjust(observed.observations, observed.prior, held.mount, free=name, without=held)
+    adjusted = adjust(observed.observations, observed.prior, start.mount, free=name, without=start)
     return _Freed(adjusted.extra, adjusted, 6)
 
 

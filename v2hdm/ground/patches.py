@@ -148,10 +148,10 @@ def _looked_up(table: FloatArray, down: _Edge, across: _Edge) -> FloatArray:
     """
     values = table.ravel()
     place = down.cell * table.shape[1] + across.cell
-    rest = 1 - across.into
-    upper = values.take(place) * rest + values.take(place + 1) * across.into
+    remainder = 1 - across.into
+    upper = values.take(place) * remainder + values.take(place + 1) * across.into
     place += table.shape[1]
-    lower = values.take(place) * rest + values.take(place + 1) * across.into
+    lower = values.take(place) * remainder + values.take(place + 1) * across.into
     return np.asarray(upper * (1 - down.into) + lower * down.into)
 
 
@@ -198,8 +198,8 @@ def patch_centres(
         return centres
     low = centres.min(axis=0) - STRIP_M
     high = centres.max(axis=0) + STRIP_M
-    around = path_map[((path_map >= low) & (path_map <= high)).all(axis=1)]
-    distance_m = np.linalg.norm(centres[:, None] - around[None], axis=2)
+    nearby_map = path_map[((path_map >= low) & (path_map <= high)).all(axis=1)]
+    distance_m = np.linalg.norm(centres[:, None] - nearby_map[None], axis=2)
     return np.asarray(centres[distance_m.min(axis=1, initial=np.inf) <= STRIP_M])
 
 

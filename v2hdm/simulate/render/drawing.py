@@ -189,23 +189,24 @@ def _lay_over(plane: Any, row: Any, place: Any, colour: Any, opacity: Any) -> No
 
 @exact_kernel
 def look_at_faces(
-    bands: Any, some: Any, edges: Plane, edge_rows: IntArray, rays: Any, planes: Plane, per_focal: Any,
+    bands: Any, span: Any, edges: Plane, edge_rows: IntArray, rays: Any, planes: Plane, per_focal: Any,
     places: IntArray, out: Plane, covers: BoolArray,
 ) -> None:  # fmt: skip
-    """Write coverage, metres along both sides, and a pixel's size (4, ...) of ``some`` faces of boxes.
+    """Write coverage, metres along both sides, and a pixel's size (4, ...) of faces of boxes.
 
-    ``planes`` (F, 3, 3) are of faces from pinhole pixels. A window's pixels begin at its ``places`` (K,);
-    ``covers`` (K,) says whether its face covers any.
+    ``span`` are the number of the first face and the one after the last. ``planes`` (F, 3, 3) are of faces
+    from pinhole pixels. A window's pixels begin at its ``places`` (K,); ``covers`` (K,) says whether its face
+    covers any.
     """
     windows, rows = bands
     u, v = rays
-    for p in range(some[0], some[1]):
+    for p in range(span[0], span[1]):
         m = planes[p]
         for n in range(rows[p], rows[p + 1]):
             width = windows[n, 3] - windows[n, 2]
             covers[n] = False
             for row in range(windows[n, 0], windows[n, 1]):
-                shift = places[n] - places[rows[some[0]]] + (row - windows[n, 0]) * width - windows[n, 2]
+                shift = places[n] - places[rows[span[0]]] + (row - windows[n, 0]) * width - windows[n, 2]
                 columns = (windows[n, 2], windows[n, 3])
                 parts = (edge_rows[p], edge_rows[p + 1])
                 covers[n] |= _cover(edges, parts, rays, row, columns, out, 0, shift)
@@ -223,7 +224,7 @@ def look_at_faces(
 
 @exact_kernel
 def draw_faces(
-    bands: Any, some: Any, places: IntArray, covers: BoolArray, seen: Plane, waves: Plane, pictures: Plane,
+    bands: Any, span: Any, places: IntArray, covers: BoolArray, patches: Plane, waves: Plane, pictures: Plane,
     tile: Plane, scales: Plane, looks: Plane, radiance: Plane, hidden: NDArray[np.uint8],
 ) -> None:  # fmt: skip
     """Draw what :func:`look_at_faces` saw over ``radiance`` (H, 3 W) and as 1 into ``hidden`` (H, W).
@@ -232,7 +233,7 @@ def draw_faces(
     ``looks`` (F, 6) are a face's radiance and whether it is corrugated, upright, and has a picture.
     """
     windows, rows = bands
-    for p in range(some[0], some[1]):
+    for p in range(span[0], span[1]):
         per_m = scales[p, 0]
         turn_x = scales[p, 1]
         turn_y = scales[p, 2]
@@ -248,16 +249,16 @@ def draw_faces(
                 continue
             width = windows[n, 3] - windows[n, 2]
             for row in range(windows[n, 0], windows[n, 1]):
-                shift = places[n] - places[rows[some[0]]] + (row - windows[n, 0]) * width - windows[n, 2]
+                shift = places[n] - places[rows[span[0]]] + (row - windows[n, 0]) * width - windows[n, 2]
                 for column in range(windows[n, 2], windows[n, 3]):
                     at = column + shift
-                    covered = read(seen, 0, at)
+                    covered = read(patches, 0, at)
                     write(hidden, row, column, _u(1) if covered > HALF else read_back(hidden, row, column))
-                    up = read(seen, 2, at)
+                    up = read(patches, 2, at)
                     tone = ONE + _f(0.1) * sampled(
-                        tile, read(seen, 1, at), up * _f(0.35), per_m, turn_x, turn_y
+                        tile, read(patches, 1, at), up * _f(0.35), per_m, turn_x, turn_y
                     )
-                    fine = read(seen, 3, at) * _f(20.0)
+                    fine = read(patches, 3, at) * _f(20.0)
                     tone += relief * clip(read(waves, 0, at) * _f(2.5), _f(-1.0), ONE) / (ONE + fine * fine)
                     tone *= foot + dark * clip(up * _f(1.2), ZERO, ONE)
                     tone = clip(tone, _f(0.2), _f(1.8))

@@ -189,8 +189,13 @@ def _slabs(ground: Ground, slab_m: tuple[float, float], field: GroundField, out:
 
 
 def _marks(marks: GroundMarks, field: GroundField, out: Float32) -> None:
-    placed = float32s(np.array([*marks.origin_map, 1.0 / marks.resolution_m]))
-    kernels.mark_ground(marks.factor, placed, field.planes, out)
+    scale = np.float32(1.0 / marks.resolution_m)
+    columns = (field.x_m - np.float32(marks.origin_map[0])) * scale
+    rows = (field.y_m - np.float32(marks.origin_map[1])) * scale
+    factor = cv2.remap(
+        marks.factor, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=128
+    )
+    out *= factor.astype(np.float32) * np.float32(1.0 / 128.0)
 
 
 class Wetness(NamedTuple):
@@ -242,12 +247,12 @@ class ShadowLayer:
         shapes = outlines(view, [on_ground_px(view, self._wider[number]) for number in numbers])
         if shapes is None:
             return
-        seen = numbers[shapes.numbers]
-        lines = [self._lines[number] for number in seen]
+        cast = numbers[shapes.numbers]
+        lines = [self._lines[number] for number in cast]
         line_rows = begins([len(part) for part in lines])
         drawing.cast_shadows(
-            bands_of(view, shapes, first), first, np.concatenate(lines), line_rows, self._softness_m[seen],
-            self._darkness[seen], field.planes, np.empty_like(out[:1]), out,
+            bands_of(view, shapes, first), first, np.concatenate(lines), line_rows, self._softness_m[cast],
+            self._darkness[cast], field.planes, np.empty_like(out[:1]), out,
         )  # fmt: skip
 
 
@@ -336,13 +341,13 @@ class PaintLayer:
         shapes = outlines(view, polygons, draped)
         if shapes is None:
             return
-        seen = visible[shapes.numbers]
+        painted = visible[shapes.numbers]
         first = field.first_row
         bands = bands_of(view, shapes, first)
         drawing.draw_paint(
             bands, first, edges_of(shapes), shapes.edge_rows, field.rays, field.planes,
-            tuple(tile.padded for tile in self._tiles), self._scales[seen], self._looks[seen],
-            self._kinds[seen], np.empty_like(field.x_m[:1]), albedo, labels,
+            tuple(tile.padded for tile in self._tiles), self._scales[painted], self._looks[painted],
+            self._kinds[painted], np.empty_like(field.x_m[:1]), albedo, labels,
         )  # fmt: skip
 
 

@@ -19,7 +19,6 @@ from v2hdm.simulate.render.pixels import (
     between,
     clip,
     fade,
-    fma,
     read,
     read_back,
     sampled,
@@ -100,48 +99,6 @@ def ground_tone(tiles: Any, scales: Plane, amplitudes: Plane, coarse: Plane, gro
             tone += noise * (fade(footprint, medium_per_wave) * stains)
             tone += read(coarse, row, column) * large
             write(out, row, column, clip(tone + ONE, _f(0.25), _f(2.5)))
-
-
-@exactly_inlined
-def _mark(marks: Any, row: Any, column: Any) -> Any:
-    """The factor of an element of a raster (R, C), 128 beside it."""
-    height, width = _i(marks.shape[0]), _i(marks.shape[1])
-    is_inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    factor = _f(read(marks, min(max(row, _i(0)), _i(height - 1)), min(max(column, _i(0)), _i(width - 1))))
-    return factor if is_inside else _f(128.0)
-
-
-@exactly_inlined
-def _mark_at(marks: Any, x: Any, y: Any) -> Any:
-    """The factor between four elements of a raster, a whole number as ``cv2.remap`` has it."""
-    left = _f(np.floor(x))
-    top = _f(np.floor(y))
-    column = _i(left)
-    row = _i(top)
-    right = _i(column + _i(1))
-    under = _i(row + _i(1))
-    share_x = x - left
-    upper = _mark(marks, row, column)
-    lower = _mark(marks, under, column)
-    above = fma(share_x, _mark(marks, row, right) - upper, upper)
-    below = fma(share_x, _mark(marks, under, right) - lower, lower)
-    return _f(np.rint(fma(y - top, below - above, above)))
-
-
-@exact_kernel
-def mark_ground(marks: NDArray[np.uint8], placed: Any, ground: Any, tone: Plane) -> None:
-    """Multiply a tone (H', W) by the factors / 128 of ``marks`` (R, C).
-
-    These begin at x and y of ``placed`` and have as many elements a metre as its third says.
-    """
-    x_m, y_m, _ = ground
-    x0_m, y0_m, per_metre = placed
-    for row in range(tone.shape[0]):
-        for column in range(tone.shape[1]):
-            x = (read(x_m, row, column) - x0_m) * per_metre
-            y = (read(y_m, row, column) - y0_m) * per_metre
-            factor = _mark_at(marks, x, y) * _f(1.0 / 128.0)
-            write(tone, row, column, read_back(tone, row, column) * factor)
 
 
 @exact_kernel

@@ -176,22 +176,22 @@ def _draw_faces(
     covers = np.empty(len(places), dtype=np.bool_)
     scales = np.array([face.dirt_scale for face in faces])
     looks = np.array([face.look for face in faces], dtype=np.float32)
-    for some in _groups(places[bands.rows]):
-        first, end = places[bands.rows[list(some)]]
-        seen = np.empty((4, end - first), dtype=np.float32)
+    for span in _groups(places[bands.rows]):
+        first, end = places[bands.rows[list(span)]]
+        patches = np.empty((4, end - first), dtype=np.float32)
         drawing.look_at_faces(
-            bands, some, edges, shapes.edge_rows, rays, planes, per_focal, places, seen, covers
+            bands, span, edges, shapes.edge_rows, rays, planes, per_focal, places, patches, covers
         )
-        waves = np.sin(seen[1:2] * np.float32(2 * np.pi / _CORRUGATION_M))
-        pictures = np.empty((3, end - first if looks[slice(*some), 5].any() else 0), dtype=np.float32)
-        pictured = [number for number in range(*some) if faces[number].picture is not None]
+        waves = np.sin(patches[1:2] * np.float32(2 * np.pi / _CORRUGATION_M))
+        pictures = np.empty((3, end - first if looks[slice(*span), 5].any() else 0), dtype=np.float32)
+        pictured = [number for number in range(*span) if faces[number].picture is not None]
         for number in pictured:
             for k in range(*bands.rows[number : number + 2]):
                 part = slice(places[k] - first, places[k + 1] - first)
-                pixels = seen[1:, part].reshape(3, heights[k], widths[k])
+                pixels = patches[1:, part].reshape(3, heights[k], widths[k])
                 pictures[:, part] = _pictured(faces[number], pixels)
         drawing.draw_faces(
-            bands, some, places, covers, seen, waves, pictures, _DIRT_TILE.padded, scales, looks,
+            bands, span, places, covers, patches, waves, pictures, _DIRT_TILE.padded, scales, looks,
             _rows(radiance), hidden.view(np.uint8),
         )  # fmt: skip
 

@@ -91,8 +91,8 @@ class Cells:
         """Add the light (along, across) of one image."""
         count = len(_BESIDE_M)
         beside = _median_along(np.stack([light[:, :count], light[:, -count:]]))
-        around = np.arange(len(light))[:, None] + np.arange(-4, 5)
-        ground = _median_along(beside[:, np.clip(around, 0, len(light) - 1)])
+        window = np.arange(len(light))[:, None] + np.arange(-4, 5)
+        ground = _median_along(beside[:, np.clip(window, 0, len(light) - 1)])
         ground = np.stack([*ground, ground.mean(axis=0)])
         self.contrasts.append(light[:, count:-count] / np.maximum(ground, 1e-4)[..., None] - 1.0)
 
@@ -251,8 +251,8 @@ def _best_views(
         if image.camera not in footage.calibrations:
             continue
         info = footage.calibrations[image.camera].info
-        near = tree.query_ball_point(pose[:2, 3], _NEAR_M)
-        numbers = np.array([number for number in near if (index, number) in shown], dtype=np.intp)
+        neighbours = tree.query_ball_point(pose[:2, 3], _NEAR_M)
+        numbers = np.array([number for number in neighbours if (index, number) in shown], dtype=np.intp)
         if not len(numbers):
             continue
         corners = corners_map[numbers]
