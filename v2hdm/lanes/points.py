@@ -343,10 +343,11 @@ def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
     sigma_m = _kernel_sigma_m(points, tangent, cloud, pairs, least_images)
     for _ in range(_ITERATIONS):
         points, tangent = _shift(points, tangent, cloud, pairs, sigma_m)
-    near = _near(points, tangent, cloud, pairs, (NODE_SPACING_M, 0.5 * HALF_WIDTH_M))
-    images = _images_of(near.seed, cloud.image[near.point], len(points))
-    total = np.bincount(near.seed, minlength=len(points))
-    dash = np.bincount(near.seed, cloud.dash[near.point].astype(float), len(points)) / np.maximum(total, 1)
+    neighbours = _near(points, tangent, cloud, pairs, (NODE_SPACING_M, 0.5 * HALF_WIDTH_M))
+    images = _images_of(neighbours.seed, cloud.image[neighbours.point], len(points))
+    total = np.bincount(neighbours.seed, minlength=len(points))
+    dashes = np.bincount(neighbours.seed, cloud.dash[neighbours.point].astype(float), len(points))
+    dash = dashes / np.maximum(total, 1)
     supported = np.flatnonzero(images >= least_images)
     chosen = supported[_thin(points[supported], tangent[supported], images[supported])]
     return Nodes(points[chosen], tangent[chosen], images[chosen], dash[chosen])
@@ -417,13 +418,13 @@ def _kernel_sigma_m(
     usual_m = np.full(count, _KERNEL_SIGMA_M)
     if not len(cloud.beside_m):
         return usual_m
-    near = _near(points, tangent, cloud, pairs, (_HALF_LENGTH_M, HALF_WIDTH_M))
-    image = cloud.image[near.point]
-    beside_m = cloud.beside_m[near.point]
+    neighbours = _near(points, tangent, cloud, pairs, (_HALF_LENGTH_M, HALF_WIDTH_M))
+    image = cloud.image[neighbours.point]
+    beside_m = cloud.beside_m[neighbours.point]
     shows_both = np.isfinite(beside_m)
-    of_both = near.seed[shows_both]
+    of_both = neighbours.seed[shows_both]
     double_count = _images_of(of_both, image[shows_both], count)
-    image_count = _images_of(near.seed, image, count)
+    image_count = _images_of(neighbours.seed, image, count)
     is_double = (double_count >= max(least_images, 1)) & (double_count >= _SHOW_BOTH * image_count)
     total_m = np.bincount(of_both, beside_m[shows_both], count)
     mean_m = total_m / np.maximum(np.bincount(of_both, minlength=count), 1)
